@@ -98,8 +98,8 @@ __all__ = [
     "Progress", "PyramidPupils", "Region", "Registration", "RegistrationEstimate", "Reporter", "ScreenInfo",
     "ScreenState", "SendReport", "SensorGeometry", "ShellHealth", "ShellState", "SubApertureGrid", "System",
     "Target", "TipTiltModulator", "__version__", "bundled_systems", "close_loop", "connect",
-    "docrime", "docrime_closed_loop", "errors", "escape", "find_best_gain", "find_sensor", "load_matrix", "load_system",
-    "measure_dark", "measure_model_psf", "open_system", "push_pull", "register_device", "run",
+    "docrime", "docrime_closed_loop", "errors", "escape", "find_best_gain", "find_sensor", "load_matrix",
+    "load_system", "measure_dark", "measure_model_psf", "open_system", "push_pull", "register_device", "run",
     "save_matrix", "sprint", "testing",
 ]  # fmt: skip
 

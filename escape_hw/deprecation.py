@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import functools
 import sys
 import warnings
 from collections.abc import Callable, Mapping
-from typing import Any, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
+P = ParamSpec("P")
+R = TypeVar("R")
 T = TypeVar("T", bound=type)
 
 _PACKAGES = ("escape_hw", "escape_gui", "escape_drivers", "escape_sim")
@@ -83,3 +86,30 @@ def _member_alias(owner: str, old: str, new: str) -> property:
         setattr(instance, new, value)
 
     return property(read, write, doc=f"Old name of :attr:`{new}`.")
+
+
+def renamed_keywords(**renamed: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
+    """Decorator that accepts keywords under their old names, with a :class:`RenamedWarning`.
+
+    The signature of the decorated function stays that of the present names.
+
+    Parameters
+    ----------
+    renamed
+        Old name -> present name.
+    """
+
+    def decorate(function: Callable[P, R]) -> Callable[P, R]:
+        @functools.wraps(function)
+        def wrapper(*args: Any, **options: Any) -> R:
+            for old in renamed.keys() & options.keys():
+                new = renamed[old]
+                warn_renamed(renamed_text(f"{function.__name__}({old}=)", f"{function.__name__}({new}=)"))
+                if new in options:
+                    raise TypeError(f"{function.__name__}(): {old}= and {new}= are the same; give one")
+                options[new] = options.pop(old)
+            return function(*args, **options)
+
+        return wrapper
+
+    return decorate

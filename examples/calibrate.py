@@ -35,6 +35,6 @@ for name, result in (("DO-CRIME", docrime), ("ESCAPE", escape)):
     print(f"{name:>8} against push-pull: median gain {gain:.3f}, median correlation {agreement:.4f}")
 
 print(f"SPRINT {'converged' if escape.registration.converged else 'did NOT converge'}:")
-for name, estimate in escape.registration.measured().items():
-    true_value = getattr(injected, name)
-    print(f"{name:>18}: {estimate.value:8.3f} ± {estimate.sigma:.3f} {estimate.unit} (injected {true_value:g})")
+for name, estimate in escape.registration.parameters().items():
+    value = getattr(injected, name)
+    print(f"{name:>18}: {estimate.value:8.3f} ± {estimate.sigma:.3f} {estimate.unit} (injected {value:g})")

@@ -71,6 +71,4 @@ if __name__ == "__main__":
     escape_hw.register_device("acme", make_mirror)
     with escape_hw.open_system("razor-shwfs", set=["devices.dm.sim_driver=acme"]) as bench:
         report = bench.dm.send(np.full(bench.dm.info.n_act, 0.9))
-        print(
-            f"{bench.dm.info.model}: requested 0.9, sent {report.sent.max():.3f}; {report.guard}"
-        )
+        print(f"{bench.dm.info.model}: requested 0.9, sent {report.sent.max():.3f}; {report.guard}")

@@ -22,7 +22,7 @@ from escape_hw.io.provenance import Provenance
 
 #: Of the products that the tests save.
 ORIGIN = Provenance(basis="kl", seed=1)
-PLANTED = Registration(-16.0, -71.0, -0.77, 2.9, 0.0)
+INJECTED = Registration(-16.0, -71.0, -0.77, 2.9, 0.0)
 SIGMA = np.array([0.4, 0.5, 0.012, 0.05, 0.06])
 
 
@@ -76,9 +76,9 @@ def matrix(
 
 
 def registration(scale: float = 1.0, seed: int = 3) -> RegistrationEstimate:
-    """A SPRINT run that comes close to the planted registration."""
+    """A SPRINT run that comes close to the injected registration."""
     rng = np.random.default_rng(seed)
-    goal = PLANTED.to_array() + scale * SIGMA * rng.standard_normal(5)
+    goal = INJECTED.to_array() + scale * SIGMA * rng.standard_normal(5)
     steps = []
     for i in range(18):
         value = goal * (1 - 0.62**i) + 0.1 * SIGMA * rng.standard_normal(5) * (i > 0)
@@ -188,7 +188,7 @@ def sky_time() -> dict[str, object]:
         name: [float(s * np.sqrt(300 / f)) for f in frames] for name, s in zip(names, SIGMA, strict=True)
     }
     return {
-        "plants": 20,
+        "realisations": 20,
         "fewest_frames": {"whitened": 500, "plain": None},
         "frames": frames,
         "estimators": {

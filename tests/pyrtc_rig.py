@@ -19,9 +19,9 @@ NEEDED = "needs pyRTC: pip install 'escape-hw[interchange-pyrtc]'"
 pytest.importorskip("pyrtc", reason=NEEDED)
 yaml = pytest.importorskip("yaml")
 
-from pyrtc.loop import Loop
-from pyrtc.slopes_process import SlopesProcess
-from pyrtc.streams import clear_shms, open_stream
+from pyrtc.loop import Loop  # noqa: E402
+from pyrtc.slopes_process import SlopesProcess  # noqa: E402
+from pyrtc.streams import clear_shms, open_stream  # noqa: E402
 
 _STREAMS = ("wfs_raw", "wfs", "signal", "signal_2d", "wfc", "wfc_2d")
 

@@ -51,6 +51,6 @@ def track(n: int = 50) -> dict[str, list[float]]:
     seconds = np.linspace(0, 600, n)
     columns = {"seconds": seconds}
     for name in PARAMETERS:
-        columns[name] = fake.PLANTED.to_dict()[name] + (seconds / 60 if name == "shift_x" else 0 * seconds)
+        columns[name] = fake.INJECTED.to_dict()[name] + (seconds / 60 if name == "shift_x" else 0 * seconds)
         columns[f"{name}_sigma"] = np.full(n, 0.1)
     return {name: column.tolist() for name, column in columns.items()}

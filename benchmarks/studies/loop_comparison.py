@@ -120,7 +120,7 @@ def matrices(seed: SeedRun) -> dict[str, CalibrationResult]:
                 escape,
                 frames=options.frames,
                 accuracy=options.accuracy,
-                shape=static_light_matrix(bench, escape),
+                closed_loop_matrix=static_light_matrix(bench, escape),
             )
         )
         result = run.result

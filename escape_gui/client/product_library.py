@@ -112,7 +112,7 @@ def _collect(ready: dict[tuple[str, str, int], Future[RunContent]]) -> LoadedPro
             if result.gains is None:
                 continue
             gains[label] = GainCurve.of(label, result.gains, [one.gains.best for one in result.rounds])
-            gains |= {other: GainCurve.of(other, one) for other, one in result.beside.items()}
+            gains |= {other: GainCurve.of(other, one) for other, one in result.comparisons.items()}
     rank = {method: k for k, method in enumerate(_METHOD_ORDER)}
     ordered = dict(sorted(matrices.items(), key=lambda item: rank.get(item[1].method, len(rank))))
     return LoadedProducts(ordered, gains, errors)

@@ -39,7 +39,7 @@ class LatencyPanel(Panel):
         self.readouts = {
             "p50": Readout(theme, "median", "µs", 6),
             "p99": Readout(theme, "p99", "µs", 6),
-            "largest": Readout(theme, "largest", "µs", 6),
+            "max": Readout(theme, "largest", "µs", 6),
             "jitter_p99": Readout(theme, "jitter p99", "µs", 6),
         }
         self.plots = (

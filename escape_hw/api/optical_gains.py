@@ -1,4 +1,7 @@
-"""Optical gains: how much weaker a sensor answers on the wavefront it works on than its matrix says."""
+"""Results of the optical-gain bootstrap.
+
+The optical gain of a mode is the response of the sensor at its working point relative to its matrix.
+"""
 
 from __future__ import annotations
 
@@ -9,23 +12,24 @@ from numpy.typing import NDArray
 
 from escape_hw.api.representation import line_html, short_repr, table_html
 from escape_hw.api.results import StrehlEstimate
+from escape_hw.deprecation import renamed_members
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OpticalGains:
-    """Gain of every mode relative to a reference matrix; each field ``(n_modes,)`` unless it says else.
+    """Gain of every mode relative to a reference matrix; arrays are ``(n_modes,)``.
 
     Parameters
     ----------
     value, sigma
-        As measured, mode by mode, with standard errors (infinite where a mode was not measured).
+        Measured gains and standard errors, infinite where a mode was not measured.
     trend, trend_sigma
-        Smooth course over the order of the modes (paper: smoothed overlay).
+        Smooth curve over the modes (paper: smoothed overlay).
     best, best_sigma
-        What to scale a matrix by: the trend, and as much of each mode's own departure from it as its
-        error lets one believe.
+        Posterior mean of the gains, with which to scale a matrix: the trend plus the departure of each mode
+        weighted by its error.
     common_sigma
-        Relative standard error that all modes share beside their own, from the temporal response.
+        Relative standard error common to all modes, from the temporal response, in addition.
     """
 
     value: NDArray[np.float64]
@@ -50,23 +54,23 @@ class GainRound:
     Parameters
     ----------
     gains
-        Relative to the reference matrix, as measured in this round.
+        Gains relative to the reference matrix, measured in this round.
     poke
-        Amplitude of each mode's pokes at most, rms surface as fraction of full stroke.
+        Largest amplitude of the pokes, rms surface as fraction of full stroke.
     frames
-        Frames that it took.
+        Number of frames.
     change
-        Rms over the modes of the relative change of the gains since the loop was last scaled.
+        Relative change of the gains since the last scaling of the matrix, rms over the modes.
     expected_change
-        What the errors of both let one expect of it.
+        Expectation of that change from the errors of both.
     residual_nm
-        Rms wavefront that the sensor sees of the controlled modes, scaled by the gains.
+        Rms residual wavefront of the controlled modes, scaled by the gains.
     strehl_loss
-        Share of the Strehl ratio that the pokes cost, from their variance through the loop.
+        Relative loss of Strehl ratio due to the pokes, from their variance in closed loop.
     reached
-        Whether the asked accuracy was reached.
+        Whether the requested accuracy was reached.
     strehl
-        Of the science camera, when a model PSF was given.
+        Strehl ratios of the science camera, if a model PSF was given.
     """
 
     gains: OpticalGains
@@ -83,19 +87,18 @@ class GainRound:
 
 @dataclass(frozen=True, slots=True)
 class ClosureStep:
-    """One gain tried while closing the loop for the first time.
+    """One gain tried during the first closure of the loop.
 
     Parameters
     ----------
     gain
         Gain of the integrator.
     optical_gain, sigma
-        Mean optical gain of the matrix there, and its standard error; NaN where the loop had to be
-        opened.
+        Mean optical gain of the matrix there, and its standard error; NaN if not measured.
     residual_nm
-        Rms wavefront of the controlled modes, scaled by the optical gain.
+        Rms residual wavefront of the controlled modes, scaled by the optical gain.
     stable
-        False when the loop was opened because it diverged.
+        False if the loop diverged.
     """
 
     gain: float
@@ -105,25 +108,26 @@ class ClosureStep:
     stable: bool
 
 
+@renamed_members(beside="comparisons")
 @dataclass(frozen=True, slots=True, eq=False)
 class GainsResult:
-    """A bootstrap of the optical gains.
+    """Result of a bootstrap of the optical gains.
 
     Parameters
     ----------
     method
-        Of the matrix that the gains are relative to.
+        Calibration method of the reference matrix.
     rounds
-        One for each amplitude, in their order.
+        The rounds in chronological order.
     closure
-        The gains tried before.
+        The gains tried during the first closure.
     converged
-        Whether the last round found the gains that the loop was scaled with, at the last poke.
+        Whether the last round, at the last poke, confirmed the gains of the matrix in use.
     loop_gain
-        Gain that the loop ran with, its matrix scaled.
+        Effective gain of the loop.
     frames, lost_frames
         Of all rounds and the closure.
-    beside
+    comparisons
         Gains of other matrices by name, from the last round.
     partial
         Stopped by the operator.
@@ -136,13 +140,13 @@ class GainsResult:
     loop_gain: float
     frames: int
     lost_frames: int
-    beside: dict[str, OpticalGains] = field(default_factory=dict)
+    comparisons: dict[str, OpticalGains] = field(default_factory=dict)
     partial: bool = False
     notes: tuple[str, ...] = ()
 
     @property
     def gains(self) -> OpticalGains | None:
-        """Of the last round, if there was one."""
+        """Gains of the last round; ``None`` without rounds."""
         return self.rounds[-1].gains if self.rounds else None
 
     def __repr__(self) -> str:
@@ -154,7 +158,7 @@ class GainsResult:
         )
 
     def _repr_html_(self) -> str:
-        """For notebooks: gain by mode, and how the bootstrap went."""
+        """Table of the bootstrap and plot of the gains, for notebooks."""
         gains = self.gains
         rows: dict[str, object] = {"relative to": self.method, "rounds": len(self.rounds)}
         if gains is not None:
@@ -166,5 +170,5 @@ class GainsResult:
 
 
 def _format_mean(gains: OpticalGains) -> str:
-    """Mean over the modes, and the mean error of one."""
+    """Mean over the modes, and mean standard error of a mode."""
     return f"{np.mean(gains.best):.3f} ± {np.mean(gains.best_sigma):.3f}"

@@ -1,4 +1,4 @@
-"""Registration of the deformable mirror with respect to the wavefront sensor."""
+"""Registration of mirror and wavefront sensor: parameters, units and sign convention."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ UNITS = {
     "radial_scaling": "% of the diameter",
     "tangential_scaling": "% of the diameter",
 }
-#: From these units to sub-apertures, radians and shares of the diameter, ``(5,)``: the units of streams.
+#: Factors to the units of streams ``(5,)``: sub-apertures, radians, fractions of the diameter.
 TO_STREAM_UNITS = np.array([0.01, 0.01, np.pi / 180, 0.01, 0.01])
 
 
@@ -25,8 +25,8 @@ TO_STREAM_UNITS = np.array([0.01, 0.01, np.pi / 180, 0.01, 0.01])
 class Registration:
     """Affine registration of mirror and sensor (paper: the vector alpha, Table 1).
 
-    Seen from the sensor, an actuator that nominally stands at ``(x, y)`` (x along columns, y along
-    rows, from the centre of the sub-aperture grid) stands at ``R(rotation) S (x, y) + (shift_x,
+    Seen from the sensor, an actuator of nominal position ``(x, y)`` (x along columns, y along rows, from
+    the centre of the sub-aperture grid) is at ``R(rotation) S (x, y) + (shift_x,
     shift_y)``, where ``S = R(-a) diag(1 + radial_scaling, 1 + tangential_scaling) R(a)`` with the
     anamorphosis angle a, zero unless given, and a positive rotation turns +x towards +y. Positive
     shifts mean that the mirror moved to higher columns or rows. OOPAO's ``MisRegistration`` has the
@@ -42,8 +42,8 @@ class Registration:
         Scaling along x and along y, in % (OOPAO's names).
     anamorphosis_angle
         In degrees: the radial scaling acts along the direction at minus this angle from +x towards
-        +y (OOPAO's sense). Arrays and tables leave it out: SPRINT fits the scalings along x and y and,
-        where it is asked to, a shear beside them (:meth:`with_shear`).
+        +y (OOPAO's sense). Arrays and tables do not contain it: SPRINT fits the scalings along x and y
+        and, as an extra parameter, a shear (:meth:`with_shear`).
     """
 
     shift_x: float = 0.0
@@ -55,7 +55,7 @@ class Registration:
 
     @classmethod
     def from_array(cls, values: ArrayLike) -> Registration:
-        """Build from five numbers in the order of :data:`PARAMETERS`."""
+        """Registration from five numbers in the order of :data:`PARAMETERS`."""
         return cls(*(float(v) for v in np.asarray(values, dtype=float).reshape(5)))
 
     def to_array(self) -> NDArray[np.float64]:
@@ -63,7 +63,7 @@ class Registration:
         return np.array([getattr(self, name) for name in PARAMETERS])
 
     def to_dict(self) -> dict[str, float]:
-        """The parameters by name; the anamorphosis angle only when there is one."""
+        """The parameters by name; the anamorphosis angle only if it is not zero."""
         values = asdict(self)
         if not self.anamorphosis_angle:
             del values["anamorphosis_angle"]
@@ -80,18 +80,18 @@ class Registration:
         )
 
     def with_shear(self, shear: float) -> Registration:
-        """The same with a shear: ``S`` with ``shear / 100`` beside its diagonal.
+        """The registration with ``shear / 100`` added to the off-diagonal elements of ``S``.
 
-        Scalings along x and y, and a shear, are all that a symmetric ``S`` can be. The result has
-        its scalings along the principal axes, and the angle between these and x and y.
+        A symmetric ``S`` has two scalings and a shear. The result has the scalings along its principal axes,
+        and their angle.
 
         Parameters
         ----------
         shear
-            In %: the scaling along one diagonal less that along the other, by half.
+            In %: half the difference of the scalings along the two diagonals.
         """
         scaling_matrix = self.scaling_matrix + np.array([[0.0, shear], [shear, 0.0]]) / 100
-        # Half the angle by which the larger axis leans from x towards y.
+        # Angle of the larger principal axis from x towards y.
         axis_angle = 0.5 * np.arctan2(2 * scaling_matrix[0, 1], scaling_matrix[0, 0] - scaling_matrix[1, 1])
         mean = (scaling_matrix[0, 0] + scaling_matrix[1, 1]) / 2
         half = np.hypot((scaling_matrix[0, 0] - scaling_matrix[1, 1]) / 2, scaling_matrix[0, 1])
@@ -104,7 +104,7 @@ class Registration:
 
     @property
     def axis_scalings_and_shear(self) -> tuple[Registration, float]:
-        """The same with scalings along x and y, and the shear in % that :meth:`with_shear` gives back."""
+        """Registration with scalings along x and y, and shear in %: the inverse of :meth:`with_shear`."""
         scaling_matrix = 100 * (self.scaling_matrix - np.eye(2))
         axis_aligned = replace(
             self,
@@ -115,7 +115,7 @@ class Registration:
         return axis_aligned, float(scaling_matrix[0, 1])
 
     def affine(self, sub_aperture_m: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Matrix ``(2, 2)`` and offset ``(2,)`` in metres that place the actuators.
+        """Matrix ``(2, 2)`` and offset ``(2,)`` in metres of the actuator positions.
 
         Parameters
         ----------

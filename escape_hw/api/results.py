@@ -13,24 +13,25 @@ from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.registration import PARAMETERS, UNITS, Registration
 from escape_hw.api.representation import line_html, short_repr, table_html
 from escape_hw.api.sensor import SensorGeometry
+from escape_hw.deprecation import renamed_members
 
-#: Width of the broad pedestal that influence functions may stand on, relative to their own.
+#: Width of the broad pedestal of the influence functions, relative to their own width.
 PEDESTAL = 1.7
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ActuatorCorrections:
-    """What SPRINT found of the mirror beside gain, registration and common width.
+    """Fitted differences between the actuators and the nominal ones.
 
-    Posterior means under priors of zero mean, so what the data hardly tell is nearly zero (best
-    linear unbiased prediction; Robinson 1991).
+    They are posterior means under priors of zero mean, so a correction that the data hardly determine is
+    nearly zero (best linear unbiased prediction; Robinson 1991).
 
     Parameters
     ----------
     gain, gain_sigma
         Relative gain of every actuator beyond the common one, and its standard error ``(n_act,)``.
     width
-        Width of every influence function beyond the common one, relative ``(n_act,)``.
+        Relative width of every influence function beyond the common one ``(n_act,)``.
     pedestal
         Share of the broad pedestal in all influence functions.
     """
@@ -51,7 +52,7 @@ class Estimate:
     unit: str = ""
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values for JSON."""
+        """As a dictionary for JSON."""
         return {"value": self.value, "sigma": self.sigma, "unit": self.unit}
 
 
@@ -83,22 +84,25 @@ class SprintIteration:
     chi2: float
 
 
+@renamed_members(measured="parameters", departures="actuator_corrections")
 @dataclass(frozen=True, slots=True, eq=False)
 class RegistrationEstimate:
-    """Registration found by SPRINT.
+    """Registration estimated by SPRINT.
 
     Parameters
     ----------
     covariance
-        ``(5, 5)`` in the order and units of ``PARAMETERS``, errors of the model included.
+        ``(5, 5)`` in the order and units of ``PARAMETERS``, systematic errors of the model included.
     width
-        Scale of the influence functions' width relative to nominal.
+        Width of the influence functions relative to nominal.
+    warnings
+        Reasons not to use the estimate; ``converged`` is false if there are any.
     notes
-        What to know of it that is no reason to distrust it, such as parameters that go together.
+        Further remarks, such as parameters with strongly correlated errors.
+    actuator_corrections
+        Fitted differences of the actuators; ``None`` if they were not fitted.
     extras
-        What was fitted beside the registration, by name (``calibration.extra_parameters``).
-    departures
-        How the mirror differs from the model's; ``None`` where SPRINT did not look.
+        Estimates of the extra parameters by name.
     """
 
     registration: Registration
@@ -118,7 +122,7 @@ class RegistrationEstimate:
         """Standard errors ``(5,)`` in the order of ``PARAMETERS``."""
         return np.sqrt(np.diag(self.covariance))
 
-    def measured(self) -> dict[str, Estimate]:
+    def parameters(self) -> dict[str, Estimate]:
         """Every parameter with its standard error and unit."""
         values = self.registration.to_array()
         return {
@@ -132,15 +136,15 @@ class RegistrationEstimate:
         return f"<{type(self).__name__} {texts}; {state} in {len(self.iterations)} iterations>"
 
     def _formatted_values(self) -> dict[str, str]:
-        """Parameters and gain with errors and units."""
+        """Parameters and gain with errors and units, as texts."""
         texts = {
             name: f"{one.value:.3f} ± {one.sigma:.3f} {one.unit}"
-            for name, one in {**self.measured(), **self.extras}.items()
+            for name, one in {**self.parameters(), **self.extras}.items()
         }
         return {**texts, "gain": f"{self.gain.value:.4f} ± {self.gain.sigma:.4f}"}
 
     def _repr_html_(self) -> str:
-        """For notebooks: the parameters with their errors and units, and how SPRINT came there."""
+        """Table of the parameters and plot of the step norms, for notebooks."""
         rows = {
             **self._formatted_values(),
             "converged": f"{'yes' if self.converged else 'NO'}, {len(self.iterations)} iterations",
@@ -153,11 +157,11 @@ class RegistrationEstimate:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CalibrationResult:
-    """A measured or pseudo-synthetic interaction matrix and how it came about.
+    """A measured or pseudo-synthetic interaction matrix and its provenance.
 
-    ``partial`` is true when the operator stopped the run early. ``mean_frame`` is the mean of the
-    camera frames used to find the sub-aperture grid. ``measured`` is the DO-CRIME matrix that an
-    ESCAPE matrix was derived from.
+    ``partial`` is true if the operator stopped the run early. ``mean_frame`` is the mean of the camera frames
+    on which the geometry was found. ``measured`` is the DO-CRIME matrix to which the registration of an
+    ESCAPE matrix was fitted.
     """
 
     matrix: InteractionMatrix
@@ -186,7 +190,7 @@ class CalibrationResult:
         return f"{self.lost_frames} lost, {self.sky_seconds:.1f} s"
 
     def _repr_html_(self) -> str:
-        """For notebooks: the matrix, and the registration behind it."""
+        """Tables of the matrix and of its registration, for notebooks."""
         parts = [self.matrix._repr_html_()]
         if self.registration is not None:
             parts.append(self.registration._repr_html_())

@@ -1,4 +1,4 @@
-"""What tracking yields, second by second."""
+"""Results of tracking: table of updates, alarms, exchanges of the reconstructor."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from escape_hw.api.registration import PARAMETERS
 from escape_hw.api.results import CalibrationResult
 
-#: Columns of the table, after those of the registration.
+#: Columns of the table after those of the registration.
 _LOOP_COLUMNS = (
-    "optical_gain", "optical_gain_sigma", "misfit", "surprise", "noise", "mismatch", "residual_nm",
+    "optical_gain", "optical_gain_sigma", "misfit", "innovation", "noise", "mismatch", "residual_nm",
     "strehl", "strehl_sigma", "exchanged",
 )  # fmt: skip
 COLUMNS = ("seconds", *PARAMETERS, *(f"{name}_sigma" for name in PARAMETERS), *_LOOP_COLUMNS)
@@ -20,16 +20,16 @@ COLUMNS = ("seconds", *PARAMETERS, *(f"{name}_sigma" for name in PARAMETERS), *_
 
 @dataclass(frozen=True, slots=True)
 class Alarm:
-    """Something that a new registration does not explain.
+    """A change of the system that a new registration does not explain.
 
     Parameters
     ----------
     seconds
-        When, since tracking began.
+        Time since the start of tracking.
     kind
         ``jump``, ``misfit``, ``noise``, ``delay``, ``actuator``, ``limit``, ``diverged`` or ``dark``.
     text
-        What happened and what to do.
+        Description and remedy.
     """
 
     seconds: float
@@ -39,23 +39,23 @@ class Alarm:
 
 @dataclass(frozen=True, slots=True)
 class Exchange:
-    """A new matrix, with the evidence for it.
+    """A proposed or exchanged matrix, with the evidence for it.
 
     Parameters
     ----------
     seconds
-        When it was proposed.
+        Time of the proposal.
     accepted
-        Whether the loop runs with it.
+        Whether the loop uses it.
     change
-        Change of the registration since the matrix in use, by parameter: value and standard error.
+        Change of the registration since that of the matrix in use, by parameter: value and standard error.
     gain
         Change of the mean optical gain, relative, and its standard error.
     mismatch, mismatch_sigma
-        Rms relative difference of the two matrices, and how much of it the errors let one expect.
-    slowest, fastest
-        Least and largest loop gain of any combination of modes with the matrix in use, relative to what
-        was asked for (eigenvalues of ``R_use D_new``); the exchange makes both 1.
+        Rms relative difference of the two matrices, and its expectation from the errors.
+    min_loop_gain, max_loop_gain
+        Smallest and largest loop gain of any combination of modes with the matrix in use, relative to the
+        nominal one (eigenvalues of ``R_use D_new``); the exchange makes both 1.
     """
 
     seconds: float
@@ -64,28 +64,28 @@ class Exchange:
     gain: tuple[float, float]
     mismatch: float
     mismatch_sigma: float
-    slowest: float
-    fastest: float
+    min_loop_gain: float
+    max_loop_gain: float
 
 
 @dataclass(slots=True, eq=False)
 class TrackResult:
-    """A stretch of tracking.
+    """Result of a tracking run.
 
     Parameters
     ----------
     rows
-        One list for each column of :data:`COLUMNS`, in its order; NaN where nothing was measured.
+        One list per column of :data:`COLUMNS`, in that order; NaN where nothing was measured.
     optical_gain, optical_gain_sigma
-        Gain of every mode at the end, relative to the matrix that tracking began with ``(n_modes,)``.
+        Gain of every mode at the end, relative to the matrix at the start ``(n_modes,)``.
     exchanges, alarms
-        In the order of time.
+        In chronological order.
     latest
-        The last pseudo-synthetic matrix, whether the loop runs with it or not; ``None`` before the first.
+        The last pseudo-synthetic matrix, whether in use or not; ``None`` before the first.
     stable
-        False when the loop was opened because it diverged or went dark.
-    began_ns
-        The sensor's clock when ``seconds`` was zero.
+        False if the loop was opened because it diverged or the sensor went dark.
+    start_ns
+        Clock of the sensor at ``seconds`` = 0.
     """
 
     rows: dict[str, list[float]] = field(default_factory=lambda: {name: [] for name in COLUMNS})
@@ -118,7 +118,7 @@ class TrackResult:
         return np.array(self.rows[name])
 
     def add(self, **values: float) -> None:
-        """Append a row; what is not given is NaN."""
+        """Append a row, NaN for missing columns; raises ``ValueError`` for unknown ones."""
         unknown = set(values) - set(self.rows)
         if unknown:
             raise ValueError(f"the table has no columns {', '.join(sorted(unknown))}")

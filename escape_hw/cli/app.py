@@ -13,6 +13,7 @@ from escape_hw.cli.calibration.procedure_command import procedure_command
 from escape_hw.cli.devices import asm, camera, discover, dm, emulate, modulator, with_stand_ins
 from escape_hw.cli.products import inspection as products
 from escape_hw.cli.products import interchange
+from escape_hw.cli.renamed import current_words
 from escape_hw.cli.system import configuration as systems
 from escape_hw.cli.system import doctor, gui, keys, perf, serve, streams, udev
 from escape_hw.runtime.procedures.calibration import CALIBRATIONS
@@ -74,7 +75,7 @@ def build_app() -> typer.Typer:
     app.command("discover")(discover.discover)
     app.add_typer(udev.app, name="udev")
     app.command("emulate")(emulate.emulate)
-    app.command("rehearse")(with_stand_ins.with_stand_ins)
+    app.command("with-stand-ins")(with_stand_ins.with_stand_ins)
     app.command("streams")(streams.streams)
     return app
 
@@ -84,7 +85,7 @@ app = build_app()
 
 def run(arguments: Sequence[str] | None = None) -> None:
     """Run with these arguments (the process's own by default); ends the process."""
-    words = list(sys.argv[1:] if arguments is None else arguments)
+    words = current_words(sys.argv[1:] if arguments is None else arguments)
     if "--json" not in words:
         app(words, prog_name="escape")
     try:

@@ -117,9 +117,8 @@ class StageConfig(Section):
             text = "the magnitude must be at least 0.1"
             violations.append(RuleViolation("axis_gain", list(self.axis_gain), text))
         if self.min_points > self.max_points:
-            violations.append(
-                RuleViolation("min_points", self.min_points, f"max_points is {self.max_points}")
-            )
+            text = f"max_points is {self.max_points}"
+            violations.append(RuleViolation("min_points", self.min_points, text))
         if self.correction_source == "table" and not self.corrections:
             text = "needs stage.corrections; 'recorder' measures them"
             violations.append(RuleViolation("correction_source", self.correction_source, text))
@@ -269,19 +268,11 @@ class CameraConfig(DeviceConfig):
         columns, rows = self.sensor_px
         violations = []
         if x + width > columns or y + height > rows:
-            violations.append(
-                RuleViolation(
-                    "region", list(self.region), f"does not lie on the sensor of {columns} x {rows} pixels"
-                )
-            )
+            text = f"does not lie on the sensor of {columns} x {rows} pixels"
+            violations.append(RuleViolation("region", list(self.region), text))
         if self.exposure_s * self.frame_rate_hz > 1:
-            violations.append(
-                RuleViolation(
-                    "exposure_s",
-                    self.exposure_s,
-                    f"longer than a frame ({1 / self.frame_rate_hz:.4g} s at {self.frame_rate_hz:g} Hz)",
-                )
-            )
+            text = f"longer than a frame ({1 / self.frame_rate_hz:.4g} s at {self.frame_rate_hz:g} Hz)"
+            violations.append(RuleViolation("exposure_s", self.exposure_s, text))
         raise_violations(violations)
         return self
 
@@ -335,9 +326,8 @@ class ScreenConfig(DeviceConfig):
     def _rules(self) -> Self:
         n = len(self.screens_r0_m)
         if self.screen >= n:
-            raise_violations(
-                [RuleViolation("screen", self.screen, f"the {n} screens are numbered 0 to {n - 1}")]
-            )
+            text = f"the {n} screens are numbered 0 to {n - 1}"
+            raise_violations([RuleViolation("screen", self.screen, text)])
         return self
 
 

@@ -33,7 +33,8 @@ def sections_of(annotation: Any) -> dict[str, type[BaseModel]]:
     Keys are the tags of a union, or an empty string for a single model.
     """
     found: dict[str, type[BaseModel]] = {}
-    for option in typing.get_args(annotation) if _is_union(annotation) else (annotation,):
+    is_union = isinstance(annotation, types.UnionType) or typing.get_origin(annotation) is typing.Union
+    for option in typing.get_args(annotation) if is_union else (annotation,):
         marks: list[Any] = []
         if typing.get_origin(option) is typing.Annotated:
             option, *marks = typing.get_args(option)
@@ -169,7 +170,3 @@ def _rules(field: FieldInfo, item: int | None) -> list[Any]:
     for extra in getattr(kind, "__metadata__", ()):
         found += extra.metadata if isinstance(extra, FieldInfo) else [extra]
     return found
-
-
-def _is_union(annotation: Any) -> bool:
-    return isinstance(annotation, types.UnionType) or typing.get_origin(annotation) is typing.Union

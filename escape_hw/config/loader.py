@@ -64,9 +64,7 @@ def unknown_key_problem(path: Sequence[str | int], value: Any) -> ConfigProblem:
     if key_tree.locate_key(plain).existing == plain:
         others = ", ".join(f"'{kind}'" for kind in key_tree.kinds_with_key(plain))
         return ConfigProblem(plain, format_short(value), f"is a key of kind = {others} only")
-    suggestion = key_tree.closest_key(path)
-    hint = f" (did you mean '{suggestion}'?)" if suggestion else ""
-    return ConfigProblem(plain, format_short(value), f"unknown key{hint}")
+    return ConfigProblem(plain, format_short(value), f"unknown key{_hint(key_tree.closest_key(path))}")
 
 
 def problems_from(error: ValidationError) -> list[ConfigProblem]:
@@ -137,16 +135,18 @@ def _message(detail: ErrorDetails) -> str:
 def _wrong_kind(path: KeyPath, table: Any, field: FieldInfo | None) -> ConfigProblem:
     kinds = [] if field is None else list(key_tree.sections_of(field.annotation))
     value = table["kind"]
-    suggestion = key_tree.closest_match(str(value), kinds)
-    hint = f" (did you mean '{suggestion}'?)" if suggestion else ""
+    hint = _hint(key_tree.closest_match(str(value), kinds))
     return ConfigProblem(path, format_short(value), f"must be {' or '.join(map(repr, kinds))}{hint}")
 
 
 def _wrong_choice(detail: ErrorDetails) -> str:
     expected = detail["ctx"]["expected"]
     choices = [choice.strip("'") for choice in expected.replace(" or ", ", ").split(", ")]
-    suggestion = key_tree.closest_match(str(detail["input"]), choices)
-    return f"must be {expected}" + (f" (did you mean '{suggestion}'?)" if suggestion else "")
+    return f"must be {expected}{_hint(key_tree.closest_match(str(detail['input']), choices))}"
+
+
+def _hint(suggestion: str | None) -> str:
+    return f" (did you mean '{suggestion}'?)" if suggestion else ""
 
 
 #: Text accepted without quotes, which a shell removes: words, paths, network addresses.
@@ -195,23 +195,20 @@ def apply_overrides(
     """
     problems = []
     for override in overrides:
-        problem = _apply_override(document, override)
-        if problem is not None:
-            problems.append((override, problem))
+        path, table = override.path, document
+        if key_tree.locate_key(path).existing != path:
+            problems.append((override, unknown_key_problem(path, override.value)))
+            continue
+        for depth, name in enumerate(path[:-1], start=1):
+            inner = table.setdefault(name, {})
+            if not isinstance(inner, dict):
+                problem = ConfigProblem(path[:depth], format_short(inner), "must be a table")
+                problems.append((override, problem))
+                break
+            table = inner
+        else:
+            table[path[-1]] = override.value
     return problems
-
-
-def _apply_override(document: dict[str, Any], override: Override) -> ConfigProblem | None:
-    if key_tree.locate_key(override.path).existing != override.path:
-        return unknown_key_problem(override.path, override.value)
-    table = document
-    for depth, name in enumerate(override.path[:-1], start=1):
-        inner = table.setdefault(name, {})
-        if not isinstance(inner, dict):
-            return ConfigProblem(override.path[:depth], format_short(inner), "must be a table")
-        table = inner
-    table[override.path[-1]] = override.value
-    return None
 
 
 _ERROR_POSITION = re.compile(
@@ -270,16 +267,6 @@ def load_text(
         warn_renamed(f"{source}:{places.get(tuple(key.split('.')), 1)}  {message}")
     # A line counts for the present name of its key.
     places = {present_key(path): line for path, line in places.items()} | places
-    return _validate(document, places, source, changes, lines)
-
-
-def _validate(
-    document: dict[str, Any],
-    places: dict[KeyPath, int],
-    source: str,
-    changes: list[Override],
-    lines: list[str],
-) -> SystemConfig:
     rejected = apply_overrides(document, changes)
     problems: list[ConfigProblem] = []
     config = None
@@ -287,13 +274,13 @@ def _validate(
         config = SystemConfig.model_validate(document)
     except ValidationError as error:
         problems = problems_from(error)
-    found = [
+    messages = [
         *(problem.line(_origin_of(problem.path, places, source, changes)) for problem in problems),
         *lines,
         *(problem.line(change.origin) for change, problem in rejected),
     ]
-    if config is None or found:
-        raise ConfigError("\n".join(found))
+    if config is None or messages:
+        raise ConfigError("\n".join(messages))
     return config
 
 

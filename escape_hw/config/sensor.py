@@ -84,22 +84,13 @@ def _placement_violations(centres: tuple[tuple[float, float], ...], n_sub: int) 
     for first, second, axis in ((0, 1, 0), (2, 3, 0), (0, 2, 1), (1, 3, 1)):
         if centres[first][axis] >= centres[second][axis]:
             side = "right of" if axis == 0 else "below"
-            violations.append(
-                RuleViolation(
-                    "pupils_px",
-                    [list(centre) for centre in centres],
-                    f"the {places[second]} image must lie {side} the {places[first]} one",
-                )
-            )
+            text = f"the {places[second]} image must lie {side} the {places[first]} one"
+            violations.append(RuleViolation("pupils_px", [list(centre) for centre in centres], text))
     for first, second in combinations(range(4), 2):
         if not violations and math.dist(centres[first], centres[second]) < n_sub:
-            violations.append(
-                RuleViolation(
-                    "pupils_px",
-                    [list(centres[first]), list(centres[second])],
-                    f"the {places[first]} and {places[second]} images of {n_sub} pixels overlap",
-                )
-            )
+            text = f"the {places[first]} and {places[second]} images of {n_sub} pixels overlap"
+            pair = [list(centres[first]), list(centres[second])]
+            violations.append(RuleViolation("pupils_px", pair, text))
     return violations
 
 

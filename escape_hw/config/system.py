@@ -296,13 +296,8 @@ class SystemConfig(Section):
         if n_modes > n_act:
             violations.append(RuleViolation("basis.n_modes", n_modes, f"the mirror has {n_act} actuators"))
         if self.loop.dropped_modes >= n_modes:
-            violations.append(
-                RuleViolation(
-                    "loop.dropped_modes",
-                    self.loop.dropped_modes,
-                    f"leaves none of the {n_modes} modes; lower it",
-                )
-            )
+            text = f"leaves none of the {n_modes} modes; lower it"
+            violations.append(RuleViolation("loop.dropped_modes", self.loop.dropped_modes, text))
         raise_violations([*violations, *self._sensor_rules()])
         return self
 

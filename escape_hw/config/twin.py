@@ -298,15 +298,8 @@ class TwinVibration(Section):
     def _rules(self) -> Self:
         n, m = len(self.amplitude_rad), len(self.frequency_hz)
         if n != m:
-            raise_violations(
-                [
-                    RuleViolation(
-                        "frequency_hz",
-                        list(self.frequency_hz),
-                        f"needs one frequency for each of the {n} amplitudes, has {m}",
-                    )
-                ]
-            )
+            text = f"needs one frequency for each of the {n} amplitudes, has {m}"
+            raise_violations([RuleViolation("frequency_hz", list(self.frequency_hz), text)])
         return self
 
 

@@ -75,7 +75,7 @@ def registration_document(estimate: RegistrationEstimate | None) -> dict[str, An
     if estimate is None:
         return {"registration": None, "gain": None, "gain_sigma": None, "iterations": None, "converged": None}
     return {
-        "registration": {name: value.to_dict() for name, value in estimate.measured().items()},
+        "registration": {name: value.to_dict() for name, value in estimate.parameters().items()},
         "gain": estimate.gain.value,
         "gain_sigma": estimate.gain.sigma,
         "width": estimate.width.to_dict(),
@@ -154,7 +154,7 @@ def gains_document(result: GainsResult) -> dict[str, Any]:
         "lost_frames": result.lost_frames,
         "beside": {
             name: {"optical_gain": one.best, "sigma": one.best_sigma, "common_sigma": one.common_sigma}
-            for name, one in result.beside.items()
+            for name, one in result.comparisons.items()
         },
         "partial": result.partial,
         "notes": list(result.notes),

@@ -145,6 +145,13 @@ class RunFolder:
         return self.write_text(RESULT_FILE, dumps({**document, "products": products}) + "\n")
 
 
+#: Keys of ``result.json`` in files of version 0.1.0, and their names today.
+_RENAMED_KEYS = {
+    "planted": "injected", "planted_course": "injected_course", "planted_end": "injected_end",
+    "planted_note": "injected_note", "asked": "request",
+}  # fmt: skip
+
+
 def read_result(folder: Path | str) -> dict[str, Any]:
     """The ``result.json`` of a run folder, products as absolute paths.
 
@@ -162,6 +169,9 @@ def read_result(folder: Path | str) -> dict[str, Any]:
         raise ProductError(f"{path}: damaged; not a JSON document ({error})") from error
     if not isinstance(document, dict) or not isinstance(document.get("products"), dict):
         raise ProductError(f"{path}: it lists no products")
+    for old, new in _RENAMED_KEYS.items():
+        if old in document:
+            document.setdefault(new, document.pop(old))
     home = path.parent.absolute()
     document["products"] = {str(name): home / str(file) for name, file in document["products"].items()}
     return document

@@ -1,10 +1,11 @@
-"""The paper's results as cases: on which system, how, and what is kept of each."""
+"""The paper's results as cases: system, frames, procedure; their products, and finished runs."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,17 +13,32 @@ from escape_hw.api.procedure import Procedure
 from escape_hw.bench import Bench
 from escape_hw.config.system import SystemConfig
 from escape_hw.errors import ConfigError
-from escape_hw.io.run_folder import read_result
+from escape_hw.io import documents
+from escape_hw.io.run_folder import RunFolder, read_result
 from escape_hw.paper.experiments import (
     PAPER_REGISTRATION,
+    Table1Result,
     reproduce_maps,
     reproduce_pywfs,
     reproduce_shwfs,
     reproduce_table1,
 )
-from escape_hw.paper.products import save_maps, save_pywfs, save_shwfs, save_table1
+from escape_hw.runtime.procedures import criteria
+from escape_hw.runtime.procedures.calibration_comparison import (
+    WITH_GAINS,
+    CalibrationComparison,
+    measured_calibration,
+)
+from escape_hw.runtime.procedures.products import (
+    add_calibration,
+    add_gains,
+    add_loop,
+    product_key,
+    write_run_result,
+)
+from escape_hw.runtime.session.record import BenchRecord
 
-#: Keyword of the frames that a loop is closed for.
+#: Keyword of the frames of a closed loop.
 _LOOP_FRAMES = "loop_frames"
 
 
@@ -33,7 +49,7 @@ class PaperCase:
     Parameters
     ----------
     kind
-        Name, as the command line knows it.
+        Name on the command line.
     title
         What it shows.
     system
@@ -42,8 +58,8 @@ class PaperCase:
         Numbers of frames by the procedure's keyword.
     procedure
         Takes an open bench and the frames.
-    keep
-        Saves, judges and reports the result.
+    save
+        Saves the result, checks its criteria and writes the report.
     overrides
         Of the system's configuration.
     """
@@ -53,7 +69,7 @@ class PaperCase:
     system: str
     frames: dict[str, int]
     procedure: Callable[..., Procedure[Any]]
-    save: Callable[..., dict[str, Any]]
+    save: Callable[[RunFolder, BenchRecord, Any, float], dict[str, Any]]
     overrides: tuple[str, ...] = ()
 
     def scaled_frames(self, share: float) -> dict[str, int]:
@@ -61,7 +77,7 @@ class PaperCase:
         return {name: max(1, round(share * count)) for name, count in self.frames.items()}
 
     def minimum_frames(self, config: SystemConfig) -> dict[str, int]:
-        """Fewest frames that give its result, by the procedure's keyword: a matrix, a Strehl ratio."""
+        """Fewest frames for a matrix and for a Strehl ratio, by the procedure's keyword."""
         from escape_hw.calibration.docrime.open_loop import minimum_frames
         from escape_hw.calibration.loop.runner import minimum_strehl_frames
 
@@ -72,8 +88,129 @@ class PaperCase:
         return {name: loop if name == _LOOP_FRAMES else matrix for name in self.frames}
 
 
+# ---------------------------------------------------------------- products
+def save_comparison(
+    folder: RunFolder,
+    record: BenchRecord,
+    result: CalibrationComparison,
+    wall_seconds: float,
+    *,
+    command: str,
+    title: str,
+) -> dict[str, Any]:
+    """Save products, ``result.json`` and report of several calibrations of one system.
+
+    Returns
+    -------
+    dict
+        The run's document; its ``criteria`` say which were met.
+
+    Raises
+    ------
+    StorageError
+        Something cannot be written.
+    """
+    saved: dict[str, Path] = {}
+    for label, calibration in result.calibrations.items():
+        parents = {"docrime": saved["DO-CRIME"]} if label == "ESCAPE" and "DO-CRIME" in saved else {}
+        saved[label] = add_calibration(folder, record, product_key(label), calibration, parents)
+    for label, loop in result.loops.items():
+        # A matrix scaled by its optical gains comes from the one saved.
+        add_loop(folder, record, f"loop_{product_key(label)}", loop, saved[label.removesuffix(WITH_GAINS)])
+    if result.gains is not None:
+        others = {product_key(label): saved[label] for label in result.gains.comparisons}
+        add_gains(folder, record, "gains", result.gains, {"im": saved["ESCAPE"], **others})
+    escape = result.calibrations.get("ESCAPE")
+    estimate = None if escape is None else escape.registration
+    checks = (
+        []
+        if result.partial
+        else [criteria.sprint_converged("ESCAPE", estimate), *criteria.loop_criteria(result.loops)]
+    )
+    if not result.partial and estimate is not None and record.injected is not None:
+        checks.insert(1, criteria.injected_value_recovered("ESCAPE", estimate, record.injected))
+    if not result.partial and result.gains is not None:
+        checks.append(criteria.gains_converged(result.gains))
+    labels: dict[str, Any] = {product_key(label): {"label": label} for label in result.calibrations}
+    labels |= {f"loop_{product_key(label)}": {"label": label} for label in result.loops}
+    labels.setdefault("escape", {}).update(measured="DO-CRIME", column="")
+    document = {
+        **record.header_fields(command),
+        "title": f"{title}: {record.system}",
+        "calibrations": {k: documents.calibration_document(v) for k, v in result.calibrations.items()},
+        **documents.registration_document(estimate),
+        "loops": {label: documents.loop_document(loop) for label, loop in result.loops.items()},
+        "scans": {k: [documents.loop_document(run) for run in runs] for k, runs in result.scans.items()},
+        "criteria": checks,
+        "labels": labels,
+        "partial": result.partial,
+        "notes": list(result.notes),
+        **({"sky_time": result.sky_time} if result.sky_time else {}),
+        **record.footer_fields(wall_seconds),
+    }
+    return write_run_result(folder, document)
+
+
+def save_table1(
+    folder: RunFolder, record: BenchRecord, result: Table1Result, wall_seconds: float
+) -> dict[str, Any]:
+    """Save products, ``result.json`` and report of :func:`~escape_hw.paper.experiments.reproduce_table1`.
+
+    Returns
+    -------
+    dict
+        The run's document; its ``criteria`` say which were met.
+
+    Raises
+    ------
+    StorageError
+        Something cannot be written.
+    """
+    labels, checks = {}, []
+    estimates = {}
+    for column, calibration in result.calibrations.items():
+        if calibration.registration is None:
+            # Stopped before SPRINT: only the DO-CRIME matrix exists.
+            source = product_key(f"docrime {column}")
+            add_calibration(folder, record, source, calibration)
+            labels[source] = {"label": f"DO-CRIME {column}"}
+            continue
+        name = product_key(f"escape {column}")
+        measured = measured_calibration(calibration)
+        parents = {}
+        if measured is not None:
+            source = product_key(f"docrime {column}")
+            parents = {source: add_calibration(folder, record, source, measured)}
+            labels[source] = {"label": f"DO-CRIME {column}"}
+        add_calibration(folder, record, name, calibration, parents)
+        labels[name] = {"label": f"ESCAPE {column}", "measured": f"DO-CRIME {column}", "column": column}
+        checks.append(criteria.sprint_converged(column, calibration.registration))
+        estimates[column] = calibration.registration
+        if record.injected is not None:
+            checks.append(
+                criteria.injected_value_recovered(column, calibration.registration, record.injected)
+            )
+    if len(estimates) == 2:
+        checks += criteria.short_and_long_agree(*estimates.values())
+    document = {
+        **record.header_fields("reproduce table1"),
+        "title": f"Registration from short and long runs: {record.system}",
+        "table1": {k: documents.calibration_document(v) for k, v in result.calibrations.items()},
+        "criteria": [] if result.partial else checks,
+        "labels": labels,
+        "partial": result.partial,
+        **record.footer_fields(wall_seconds),
+    }
+    return write_run_result(folder, document)
+
+
+# ---------------------------------------------------------------- the cases
 def _table1(bench: Bench, *, short: int, long: int) -> Procedure[Any]:
     return reproduce_table1(bench, frames={"SHORT": short, "LONG": long})
+
+
+def _save(kind: str, title: str) -> Callable[..., dict[str, Any]]:
+    return partial(save_comparison, command=f"reproduce {kind}", title=title)
 
 
 CASES = {
@@ -85,23 +222,25 @@ CASES = {
         ),
         PaperCase(
             "shwfs", "Shack-Hartmann bench: matrices and loops", "razor-shwfs",
-            {"frames": 10_000, "loop_frames": 30_000}, reproduce_shwfs, save_shwfs, PAPER_REGISTRATION,
+            {"frames": 10_000, "loop_frames": 30_000}, reproduce_shwfs,
+            _save("shwfs", "Calibration without a source"), PAPER_REGISTRATION,
         ),
         PaperCase(
             "pywfs", "pyramid bench: matrices, optical gains, loops with and without them", "razor-pywfs",
-            {"frames": 100_000, "closed_frames": 20_000, "loop_frames": 20_000},
-            reproduce_pywfs, save_pywfs,
+            {"frames": 100_000, "closed_frames": 20_000, "loop_frames": 20_000}, reproduce_pywfs,
+            _save("pywfs", "Calibration and optical gains without a source"),
         ),
         PaperCase(
-            "maps", "telescope with a dirty mirror: matrix, simulation and loops", "maps-nir",
-            {"frames": 60_000, "loop_frames": 10_000}, reproduce_maps, save_maps,
+            "maps", "telescope with a contaminated mirror: matrix, simulation and loops", "maps-nir",
+            {"frames": 60_000, "loop_frames": 10_000}, reproduce_maps,
+            _save("maps", "Calibration on the sky, with a contaminated mirror"),
         ),
     )
 }  # fmt: skip
 
 
 def select_cases(kinds: Sequence[str] | None) -> list[PaperCase]:
-    """The cases of these kinds, or all, in their own order.
+    """The cases of these kinds, or all, in the order of the paper.
 
     Raises
     ------
@@ -115,12 +254,12 @@ def select_cases(kinds: Sequence[str] | None) -> list[PaperCase]:
 
 
 def check_share(cases: Sequence[tuple[PaperCase, SystemConfig]], share: float) -> None:
-    """Refuse a share of the frames that would end in errors after minutes, or with nothing to compare.
+    """Refuse a share of the frames that is too small for a matrix or a Strehl ratio.
 
     Parameters
     ----------
     cases
-        What is to run, and how it is configured.
+        The cases to run, with their configurations.
     share
         Share of the frames of each.
 
@@ -130,64 +269,67 @@ def check_share(cases: Sequence[tuple[PaperCase, SystemConfig]], share: float) -
         Too small; names the least share.
     """
     short = [
-        (minimum_frames / case.frames[name], case, name, minimum_frames)
+        (minimum / case.frames[name], case, name, minimum)
         for case, config in cases
-        for name, minimum_frames in case.minimum_frames(config).items()
-        if case.scaled_frames(share)[name] < minimum_frames
+        for name, minimum in case.minimum_frames(config).items()
+        if case.scaled_frames(share)[name] < minimum
     ]
     if short:
-        wanted, case, name, minimum_frames = max(short, key=lambda one: one[0])
+        wanted, case, name, minimum = max(short, key=lambda one: one[0])
         enough = math.ceil(1000 * wanted) / 1000
         raise ConfigError(
-            f"--share {share:g}: too small; {case.kind} needs at least {minimum_frames} frames ({name}) and would get "
-            f"{case.scaled_frames(share)[name]} of {case.frames[name]}; the least is --share {enough:g}"
+            f"--share {share:g}: too small; {case.kind} needs at least {minimum} frames ({name}) and would "
+            f"get {case.scaled_frames(share)[name]} of {case.frames[name]}; the least is --share {enough:g}"
         )
 
 
+# ---------------------------------------------------------------- finished runs
 def request_fields(
     counts: Mapping[str, int], overrides: Sequence[str] | None, seed: int | None
 ) -> dict[str, Any]:
-    """What a part is asked for, as its document keeps it."""
+    """The request of a case, as its document stores it."""
     return {**counts, "set": list(overrides or ()), "seed": seed}
 
 
-def load_finished(folder: Path, kind: str, asked: Mapping[str, Any]) -> dict[str, Any] | None:
-    """The document of a part that ran to its end in this folder; ``None`` when there is none.
+def load_finished(folder: Path, kind: str, request: Mapping[str, Any]) -> dict[str, Any] | None:
+    """The document of a finished case in this folder; ``None`` when there is none.
 
     Raises
     ------
     ProductError
-        What lies there is damaged.
+        The folder's document is damaged.
     ConfigError
-        It is another run, or was asked for something else.
+        It is another run, or the request was another.
     """
     if not (folder / "result.json").is_file():
         return None
     document = read_result(folder)
     if document.get("command") != f"reproduce {kind}":
-        raise ConfigError(f"{folder} holds the run of 'escape {document.get('command')}'; take another --out")
-    kept = document.get("asked", asked)
-    if kept != asked:
         raise ConfigError(
-            f"{folder} was run with {_format_request(kept)}; asked for is {_format_request(asked)}: give the same --share, --set "
-            "and --seed, or another --out"
+            f"{folder} holds the run of 'escape {document.get('command')}'; choose another --out"
+        )
+    stored = document.get("request", request)
+    if stored != request:
+        raise ConfigError(
+            f"{folder} was run with {_format_request(stored)}; requested is {_format_request(request)}: give "
+            "the same --share, --set and --seed, or another --out"
         )
     return None if document.get("partial") else {**document, "folder": str(folder)}
 
 
-def _format_request(asked: Mapping[str, Any]) -> str:
-    return ", ".join(f"{key} {value}" for key, value in asked.items() if value not in (None, []))
+def _format_request(request: Mapping[str, Any]) -> str:
+    return ", ".join(f"{key} {value}" for key, value in request.items() if value not in (None, []))
 
 
 def find_sweeps(folders: Sequence[Path]) -> dict[str, Path]:
-    """Sweeps by the name that the paper's table knows them by: ``sweep-shwfs``, ``sweep-pywfs``.
+    """Sweeps by their name in the table of the paper's numbers: ``sweep-shwfs``, ``sweep-pywfs``.
 
     Raises
     ------
     ProductError
         One is no run folder.
     ConfigError
-        One is no sweep, or of another system than the paper's.
+        One is no sweep, unfinished, or of another system than the paper's.
     """
     found = {}
     for folder in folders:
@@ -197,8 +339,8 @@ def find_sweeps(folders: Sequence[Path]) -> dict[str, Path]:
             raise ConfigError(f"--sweep {folder}: not a sweep of razor-shwfs or razor-pywfs")
         if document.get("partial"):
             raise ConfigError(
-                f"--sweep {folder}: it was broken off; finish it (escape sweep --resume {folder} --out NEW) "
-                "and give the new folder"
+                f"--sweep {folder}: unfinished; finish it (escape sweep --resume {folder} --out NEW) and "
+                "give the new folder"
             )
         found[f"sweep-{system.removeprefix('razor-')}"] = folder
     return found

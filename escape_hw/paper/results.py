@@ -35,17 +35,7 @@ TABLE1 = {
 
 @dataclass(frozen=True, slots=True)
 class PaperNumber:
-    """One number of the paper.
-
-    Parameters
-    ----------
-    what
-        What is stated.
-    paper
-        The paper's value or words.
-    ours
-        Ours; ``None`` when the run that gives it is not there.
-    """
+    """A quantity, its value or words in the paper, and our value; ``None`` without the run that gives it."""
 
     what: str
     paper: str
@@ -54,17 +44,7 @@ class PaperNumber:
 
 @dataclass(frozen=True, slots=True)
 class PaperRun:
-    """The numbers that one run gives.
-
-    Parameters
-    ----------
-    kind
-        Name of the run in a collection of them.
-    command
-        What makes it.
-    numbers
-        Takes the run, or ``None`` when it is not there.
-    """
+    """Name and command of a run, and the function that reads its numbers (from ``None`` without the run)."""
 
     kind: str
     command: str
@@ -79,7 +59,7 @@ def _table1_numbers(run: RunContent | None) -> Iterator[PaperNumber]:
     found: dict[str, dict[str, float]] = {}
     for column, stated in TABLE1.items():
         result = _calibration(run, f"ESCAPE {column}")
-        measured = None if result is None or result.registration is None else result.registration.measured()
+        measured = None if result is None or result.registration is None else result.registration.parameters()
         for name, value in stated.items():
             title, unit = TITLES[name]
             ours = None
@@ -89,7 +69,7 @@ def _table1_numbers(run: RunContent | None) -> Iterator[PaperNumber]:
             yield PaperNumber(f"Table 1, {column}: {title} [{unit}]", value.replace("-", "−"), ours)
     largest = None
     if len(found) == 2:
-        # Tangential scaling is left out, as in the paper: it is nothing.
+        # Tangential scaling is left out, as in the paper: its value is zero.
         pairs = [(found["SHORT"][p], found["LONG"][p]) for p in PARAMETERS[:4]]
         largest = f"{max(100 * abs(a - b) / abs(b) for a, b in pairs):.1f} %"
     yield PaperNumber("Table 1: largest inconsistency of SHORT and LONG", "8 %", largest)
@@ -135,7 +115,7 @@ def _format_gains(gains: OpticalGains | None) -> str | None:
 
 def _pywfs_numbers(run: RunContent | None) -> Iterator[PaperNumber]:
     result = None if run is None else next(iter(run.gains.values()), None)
-    beside: Mapping[str, OpticalGains] = {} if result is None else result.beside
+    beside: Mapping[str, OpticalGains] = {} if result is None else result.comparisons
     yield PaperNumber(
         "pyramid, optical gain of the baseline",
         "< 1, roughly constant",
@@ -185,7 +165,7 @@ def _sweep_numbers(run: RunContent | None) -> Iterator[PaperNumber]:
     share = None
     if sweep is not None and "matrix" in sweep["importance"]:
         share_of_matrix, chance = sweep["importance"]["matrix"], sweep["importance"].get("chance", 0.0)
-        share = f"{100 * share_of_matrix:.1f} % of the variance; a parameter that does nothing {100 * chance:.1f} %"
+        share = f"{100 * share_of_matrix:.1f} % of the variance; a dummy parameter {100 * chance:.1f} %"
     yield PaperNumber(f"{name}: importance of the choice of matrix", "little or none", share)
     stated = [
         row["text"]
@@ -209,15 +189,15 @@ RESULTS = "results.md"
 
 
 def write_results(folder: Path, runs: Mapping[str, Path]) -> Path:
-    """Write ``results.md`` with one row per number, ``results.json``, and a picture per figure.
+    """Write ``results.md`` with one row per number, ``results.json``, and an image per figure.
 
     Parameters
     ----------
     folder
-        Where to.
+        Target folder.
     runs
-        Run folders by the kinds of :data:`~escape_hw.paper.results.PAPER_RUNS`. What is missing says so,
-        with the command that makes it.
+        Run folders by the kinds of :data:`~escape_hw.paper.results.PAPER_RUNS`. Missing ones are marked,
+        with the command that runs them.
 
     Returns
     -------
@@ -236,7 +216,7 @@ def write_results(folder: Path, runs: Mapping[str, Path]) -> Path:
     simulated = any(run.simulated for run in contents.values())
     lines = ["# The paper's numbers and ours", ""]
     if simulated:
-        lines += ["SIMULATED: ours come from digital twins.", ""]
+        lines += ["SIMULATED: ours come from simulations.", ""]
     lines += ["| number | paper | ours | command |", "|---|---|---|---|"]
     rows = [(part, number) for part in PAPER_RUNS for number in part.numbers(contents.get(part.kind))]
     lines += [_table_row(number, part.command) for part, number in rows]
@@ -258,12 +238,12 @@ def _table_row(number: PaperNumber, command: str) -> str:
 
 
 def _figures(kind: str, run: RunContent) -> Iterator[tuple[str, str, Figure]]:
-    """File name, caption and figure of whatever the paper shows of a run."""
+    """File name, caption and figure of each of the paper's figures of a run."""
     name = str(run.document["system"])
     for label, estimate in run.estimates().items():
         if estimate.iterations:
             caption = f"{name}: convergence of SPRINT {label}".strip()
-            yield f"{kind}-convergence", caption, figures_registration.convergence(estimate, run.planted)
+            yield f"{kind}-convergence", caption, figures_registration.convergence(estimate, run.injected)
             break
     matrices = run.matrices()
     if matrices and kind != "table1" and not kind.startswith("sweep"):
@@ -288,19 +268,14 @@ INDEX_PAGE = "index.html"
 
 
 def write_index(folder: Path, parts: Mapping[str, Mapping[str, Any]]) -> Path:
-    """Write ``index.html``.
+    """Write ``index.html`` with links to the reports of the runs, and return its path.
 
     Parameters
     ----------
     folder
-        Where to; links are relative to it.
+        Target folder; links are relative to it.
     parts
         Documents of the runs by name, each with its ``criteria`` and its ``products``.
-
-    Returns
-    -------
-    Path
-        The page written.
 
     Raises
     ------
@@ -311,7 +286,7 @@ def write_index(folder: Path, parts: Mapping[str, Mapping[str, Any]]) -> Path:
     body = ["<h1>The paper's tables and figures, reproduced</h1>"]
     body += [_run_section(folder, name, document) for name, document in parts.items()]
     simulated = any(document.get("simulated") for document in parts.values())
-    band = "SIMULATED: every number comes from a digital twin" if simulated else "HARDWARE"
+    band = "SIMULATED: every number comes from a simulation" if simulated else "HARDWARE"
     path = folder / INDEX_PAGE
     write_atomic(
         path, html.page("Reproduced", [("simulated" if simulated else "hardware", band)], body).encode()

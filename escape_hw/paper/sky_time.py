@@ -1,11 +1,9 @@
-"""Sky time: the error of the registration against the frames spent, over random plants on a twin."""
+"""Sky time: error of the registration against the number of frames, over random simulated registrations."""
 
 from __future__ import annotations
 
-import multiprocessing
-import signal
 from collections.abc import Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, Future, wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from typing import Any
@@ -32,25 +30,26 @@ from escape_hw.config.devices import DeviceConfig
 from escape_hw.config.loader import load_system, load_text
 from escape_hw.config.system import SystemConfig
 from escape_hw.errors import Aborted, CalibrationError, TooFewFrames
+from escape_hw.runtime.host.processes import open_process_pool, terminate_pool
 from escape_hw.runtime.session.system import System
 
-#: Half ranges of the random plants, in the units of the registration.
+#: Half ranges of the random registrations, in the units of the registration.
 HALF_RANGES = np.array([100.0, 100.0, 2.0, 4.0, 4.0])
-#: The accuracy asked for: rms errors in the same units.
+#: Required accuracy: rms errors in the same units.
 GOAL = np.array([1.0, 1.0, 0.02, 0.1, 0.1])
-#: The same on a pyramid, whose sub-apertures are pixels of the pupil image.
+#: Required accuracy on a pyramid, whose sub-apertures are pixels of the pupil image.
 PYRAMID_GOAL = np.array([4.0, 4.0, 0.05, 0.2, 0.2])
 #: Frames at which the errors are taken.
 FRAMES = (20, 50, 100, 220, 300, 500, 1000)
-#: The paper's matrix, the whitened one, and the whitened frames themselves.
+#: From the paper's matrix, from the whitened matrix, and from the whitened frames.
 ESTIMATORS = ("plain", "whitened", "telemetry")
-#: How long an abort may wait for its turn.
+#: Seconds between two looks at an abort.
 _POLL_S = 0.2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RealisationErrors:
-    """Errors and stated standard errors of one plant, ``(n_estimators, n_frames, 5)``; NaN if refused.
+    """Errors and stated standard errors of one realisation ``(n_estimators, n_frames, 5)``; NaN if refused.
 
     ``exact`` and ``hybrid`` are the Cramer-Rao bounds ``(n_frames, 5)``, see
     :class:`~escape_hw.calibration.sprint.cramer_rao_bound.CramerRaoBound`.
@@ -63,25 +62,25 @@ class RealisationErrors:
 
 
 def random_registration(number: int) -> Registration:
-    """The registration of plant ``number``: uniform within :data:`HALF_RANGES`."""
+    """The registration of realisation ``number``: uniform within :data:`HALF_RANGES`."""
     return Registration.from_array(np.random.default_rng(1000 + number).uniform(-1, 1, 5) * HALF_RANGES)
 
 
 def accuracy_goal(system: str | SystemConfig) -> NDArray[np.float64]:
-    """The accuracy asked for of a system's kind of sensor ``(5,)``."""
+    """Required accuracy for a system's kind of sensor ``(5,)``."""
     config = load_system(system) if isinstance(system, str) else system
     return PYRAMID_GOAL if config.sensor.kind == "pyramid" else GOAL
 
 
 def registration_overrides(injected: Registration) -> list[str]:
-    """Overrides that plant a registration in a twin."""
+    """Overrides that set the true registration of a simulation."""
     return [f"twin.registration.{name}={value!r}" for name, value in injected.to_dict().items()]
 
 
 def simulated_config(
     system: str | SystemConfig, overrides: Sequence[str] = (), seed: int | None = None
 ) -> SystemConfig:
-    """The configuration of a system with every device a twin, whatever its file says.
+    """The configuration of a system with every device simulated.
 
     Parameters
     ----------
@@ -103,10 +102,10 @@ def run_realisation(
     overrides: Sequence[str] = (),
     estimators: Sequence[str] = ESTIMATORS,
 ) -> RealisationErrors:
-    """Record one run on one plant and estimate its registration from its first frames.
+    """Record one run with one true registration and estimate it from the first frames.
 
-    The estimators get frames, indices and the commands sent; the plant is only compared at the end.
-    Without ``"whitened"`` among ``estimators`` there is no bound, for the noise is not known.
+    The estimators read frames, indices and commands; the true registration is only compared at the end.
+    Without ``"whitened"`` among ``estimators`` the noise, and with it the bound, is unknown.
     """
     injected = random_registration(number)
     config = simulated_config(system, [*overrides, *registration_overrides(injected)], seed=number + 1)
@@ -139,7 +138,7 @@ def run_realisation(
                 if order and count == max(frames):
                     bounds = _bounds(measured.record, c.lags, solution, matrix, model, frames)
         for f, count in enumerate(frames if ESTIMATORS[2] in estimators else ()):
-            # Frames of its own: a run this short must find the sensor's geometry on them as well.
+            # A separate run: the sensor's geometry, too, is found from so few frames.
             try:
                 short = bench.run(escape(bench, frames=count, estimator="telemetry")).registration
             except (TooFewFrames, CalibrationError):
@@ -160,8 +159,8 @@ def _bounds(
 ) -> NDArray[np.float64]:
     """Exact and hybrid bound ``(2, n_frames, 5)`` for the pokes of a run's first frames.
 
-    Noise, whitening filter, registration and scatter of the random effects are those that the whole run
-    tells: the bound knows them, as it must.
+    Noise, whitening filter, registration and scatter of the random effects are estimated from the whole
+    run and taken as known.
     """
     columns = decorrelate_columns(matrix, solution.gram, solution.variance)
     fit = run(fit_registration(columns, model, covariance=solution.covariance))
@@ -185,21 +184,21 @@ def _bounds(
 def sky_time(
     system: str | SystemConfig,
     *,
-    plants: int = 20,
+    realisations: int = 20,
     frames: Sequence[int] = FRAMES,
     overrides: Sequence[str] = (),
     workers: int = 2,
 ) -> Procedure[dict[str, Any]]:
-    """Run a campaign over random plants in parallel processes.
+    """Run a campaign over random registrations in parallel processes.
 
     Parameters
     ----------
     system
-        Name or path of a system, or its configuration; its twins are used.
-    plants
-        How many random plants.
+        Name or path of a system, or its configuration; it is simulated.
+    realisations
+        Number of random registrations.
     frames
-        Numbers of frames at which to take the errors, rising.
+        Numbers of frames at which to estimate, ascending.
     overrides
         Configuration overrides, ``section.key=value`` each.
     workers
@@ -208,119 +207,92 @@ def sky_time(
     Returns
     -------
     dict
-        See :func:`summary`. When a process died, or the campaign was stopped, it is about the plants
-        that were finished by then, and ``note`` says so.
+        See :func:`summary`. When a process died, or the campaign was stopped, it covers the realisations
+        finished by then, and ``note`` gives the reason.
 
     Raises
     ------
     CalibrationError
-        A process died before any plant was finished.
+        A process died before any realisation was finished.
     Aborted
-        Stopped before any plant was finished.
+        Stopped before any realisation was finished.
     """
-    report = Reporter("sky time", plants, "plant")
+    report = Reporter("sky time", realisations, "realisation")
     done: list[RealisationErrors] = []
-    context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(workers, mp_context=context, initializer=_ignore_interrupts)
+    note, pool = "", open_process_pool(workers, helper_threads=True)
     try:
-        left: set[Future[RealisationErrors]] = {
+        pending: set[Future[RealisationErrors]] = {
             pool.submit(run_realisation, system, number, tuple(frames), tuple(overrides))
-            for number in range(plants)
+            for number in range(realisations)
         }
-        while left:
-            ended, left = wait(left, timeout=_POLL_S, return_when=FIRST_COMPLETED)
-            done += [future.result() for future in ended if not _worker_died(future)]
-            died = any(map(_worker_died, ended))
-            if died or report.due():
-                # Also when a process died: whoever pressed Ctrl-C meant to stop, and is heard here.
+        while pending and not note:
+            completed, pending = wait(pending, timeout=_POLL_S, return_when=FIRST_COMPLETED)
+            done += [future.result() for future in completed if not _worker_died(future)]
+            if any(map(_worker_died, completed)):
+                note = (
+                    f"a process of the campaign died (killed, or out of memory) after {len(done)} of "
+                    f"{realisations} realisations; try fewer processes than {workers}"
+                )
+            if note or report.due():
+                # Also when a process died: a Ctrl-C that ended it is raised here.
                 yield report(len(done))
-            if died:
-                # What ended at the same time has been taken already; the others never will.
-                break
     except Aborted:
         if not done:
             raise
-        return {
-            **summary(done, frames, accuracy_goal(system)),
-            "note": f"stopped after {len(done)} of {plants} plants",
-        }
+        note = f"stopped after {len(done)} of {realisations} realisations"
     finally:
-        _terminate(pool)
-    curves = summary(done, frames, accuracy_goal(system)) if done else None
-    if len(done) == plants and curves is not None:
-        return curves
-    lost = (
-        f"a process of the campaign died (killed, or out of memory) after {len(done)} of {plants} plants; "
-        f"try fewer processes than {workers}"
-    )
-    if curves is None:
-        raise CalibrationError(lost)
-    return {**curves, "note": lost}
+        terminate_pool(pool)
+    if not done:
+        raise CalibrationError(note)
+    curves = summary(done, frames, accuracy_goal(system))
+    return {**curves, "note": note} if note else curves
 
 
 def _worker_died(future: Future[RealisationErrors]) -> bool:
-    """True when the process died; errors inside a plant are raised by its result."""
+    """True when the process died; an error of the realisation is raised by its result."""
     return isinstance(future.exception(), BrokenProcessPool)
 
 
-def _ignore_interrupts() -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-
-def _terminate(pool: ProcessPoolExecutor) -> None:
-    """End the processes at once: nobody wants what they are at any more."""
-    # Python 3.14 has a method for it.
-    workers = list((getattr(pool, "_processes", None) or {}).values())
-    pool.shutdown(wait=False, cancel_futures=True)
-    for worker in workers:
-        worker.terminate()
-
-
 def summary(
-    plants: Sequence[RealisationErrors], frames: Sequence[int], goal: NDArray[np.float64] = GOAL
+    realisations: Sequence[RealisationErrors], frames: Sequence[int], goal: NDArray[np.float64] = GOAL
 ) -> dict[str, Any]:
-    """Rms errors, normalised chi-squared and bound against frames, ready for JSON and for the report.
+    """Rms errors, normalised chi-squared and bounds against frames, for JSON and for the report.
 
-    ``fewest_frames`` is, per estimator, the least number of frames at which every parameter meets
+    ``fewest_frames`` is, by estimator, the least number of frames at which every parameter meets
     ``goal``; ``None`` where none does.
     """
-    errors = np.stack([p.errors for p in plants])
-    sigmas = np.stack([p.sigmas for p in plants])
-    met = np.isfinite(errors).all(axis=(0, 3)) & np.all(np.sqrt(np.mean(errors**2, axis=0)) <= goal, axis=2)
+    errors = np.stack([one.errors for one in realisations])
+    sigmas = np.stack([one.sigmas for one in realisations])
     rms = np.sqrt(np.mean(np.square(errors), axis=0))
+    met = np.isfinite(errors).all(axis=(0, 3)) & np.all(rms <= goal, axis=2)
     chi2 = np.mean(np.square(errors / sigmas), axis=0)
     exact, hybrid = (
-        np.sqrt(np.mean(np.square(np.stack([getattr(p, name) for p in plants])), axis=0))
+        np.sqrt(np.mean(np.square(np.stack([getattr(one, name) for one in realisations])), axis=0))
         for name in ("exact", "hybrid")
     )
-    fewest: dict[str, int | None] = {}
-    for e, name in enumerate(ESTIMATORS):
-        enough = [int(n) for f, n in enumerate(frames) if met[e, f]]
-        fewest[name] = min(enough) if enough else None
+
+    def by_parameter(curve: NDArray[np.float64]) -> dict[str, list[float | None]]:
+        return {
+            p: [float(v) if np.isfinite(v) else None for v in curve[:, k]] for k, p in enumerate(PARAMETERS)
+        }
+
     return {
-        "plants": len(plants),
+        "realisations": len(realisations),
         "frames": [int(n) for n in frames],
-        "estimators": {
-            name: {p: _finite_or_none(rms[e, :, k]) for k, p in enumerate(PARAMETERS)}
-            for e, name in enumerate(ESTIMATORS)
-        },
-        "chi2": {
-            name: {p: _finite_or_none(chi2[e, :, k]) for k, p in enumerate(PARAMETERS)}
-            for e, name in enumerate(ESTIMATORS)
-        },
-        "exact_bound": {p: _finite_or_none(exact[:, k]) for k, p in enumerate(PARAMETERS)},
-        "bound": {p: _finite_or_none(hybrid[:, k]) for k, p in enumerate(PARAMETERS)},
+        "estimators": {name: by_parameter(rms[e]) for e, name in enumerate(ESTIMATORS)},
+        "chi2": {name: by_parameter(chi2[e]) for e, name in enumerate(ESTIMATORS)},
+        "exact_bound": by_parameter(exact),
+        "bound": by_parameter(hybrid),
         "goal": {p: float(goal[k]) for k, p in enumerate(PARAMETERS)},
-        "fewest_frames": fewest,
+        "fewest_frames": {
+            name: min((int(n) for f, n in enumerate(frames) if met[e, f]), default=None)
+            for e, name in enumerate(ESTIMATORS)
+        },
     }
 
 
-def _finite_or_none(values: NDArray[np.float64]) -> list[float | None]:
-    return [float(v) if np.isfinite(v) else None for v in values]
-
-
 def table_rows(curves: dict[str, Any]) -> Iterator[tuple[str, ...]]:
-    """The curves as rows of text: estimator, frames, rms errors, and chi-squared in brackets."""
+    """The curves as rows of text: estimator, frames, rms errors with chi-squared in parentheses."""
     for name, by_parameter in curves["estimators"].items():
         for i, count in enumerate(curves["frames"]):
             cells = []

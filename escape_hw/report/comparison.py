@@ -96,7 +96,7 @@ def compare(a: CalibrationResult, b: CalibrationResult) -> MatrixComparison:
 def _registration_difference(a: CalibrationResult, b: CalibrationResult) -> dict[str, Estimate]:
     if a.registration is None or b.registration is None:
         return {}
-    first, second = a.registration.measured(), b.registration.measured()
+    first, second = a.registration.parameters(), b.registration.parameters()
     return {
         name: Estimate(
             second[name].value - first[name].value,

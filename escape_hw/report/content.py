@@ -52,9 +52,9 @@ class RunContent:
         return bool(self.document.get("simulated"))
 
     @property
-    def planted(self) -> Registration | None:
+    def injected(self) -> Registration | None:
         """The registration hidden in the twin, when there was one."""
-        values = self.document.get("planted")
+        values = self.document.get("injected")
         return Registration(**values) if values else None
 
     @property

@@ -131,19 +131,19 @@ def _registration_section(run: RunContent) -> str:
     if not estimates:
         return ""
     caption = "Registration of the mirror seen by the sensor, with standard errors."
-    if run.planted is not None:
-        caption += " Δ: difference from the planted truth, which is shown only here; no estimator reads it."
-    parts = [html.table(tables.registration_table(estimates, run.planted), caption)]
+    if run.injected is not None:
+        caption += " Δ: difference from the injected value; no estimator reads it."
+    parts = [html.table(tables.registration_table(estimates, run.injected), caption)]
     for number, (label, estimate) in enumerate(estimates.items()):
         if estimate.iterations:
             what = f" ({label})" if label else ""
             parts.append(
                 html.figure(
                     f"sprint{number}",
-                    figures_registration.convergence(estimate, run.planted),
+                    figures_registration.convergence(estimate, run.injected),
                     f"SPRINT convergence{what}: step norm (top) and the parameters per iteration. "
                     "Band: final value with its standard error."
-                    + (" Dotted: planted truth." if run.planted is not None else ""),
+                    + (" Dotted: injected value." if run.injected is not None else ""),
                 )
             )
         parts.append(html.note_list(list(estimate.warnings), "bad"))
@@ -204,34 +204,31 @@ def _track_section(run: RunContent) -> str:
     if not track or not track["seconds"]:
         return ""
     exchanges, alarms = run.document["exchanges"], run.document["alarms"]
-    planted = run.document.get("planted_course")
-    drawing = figures_track.track_figure(track, exchanges, alarms, planted)
+    injected = run.document.get("injected_course")
+    drawing = figures_track.track_figure(track, exchanges, alarms, injected)
     caption = (
         "Live registration, optical gain and image quality, with standard errors. "
         "Upright and dotted: a new matrix was taken into use. Upright and full: an alarm."
-        + (
-            ""
-            if planted is None
-            else " Dotted course: planted truth, shown only here; no estimator reads it."
-        )
+        + ("" if injected is None else " Dotted course: injected value; no estimator reads it.")
     )
     lines = tuple(
         (
             f"{one['seconds']:.0f}", "exchanged" if one["accepted"] else "proposed",
             f"{one['mismatch']:.1%} ± {one['mismatch_sigma']:.1%}",
-            f"{one['slowest']:.3f}", f"{one['fastest']:.3f}",
+            f"{one.get('min_loop_gain', one.get('slowest')):.3f}",
+            f"{one.get('max_loop_gain', one.get('fastest')):.3f}",
         )
         for one in exchanges
     )  # fmt: skip
     parts = [html.figure("track", drawing, caption)]
     if lines:
-        heads = ("seconds", "", "change of the matrix", "slowest mode", "fastest mode")
+        heads = ("seconds", "", "change of the matrix", "smallest loop gain", "largest loop gain")
         what = (
-            "New matrices. Slowest, fastest: loop gain of the modes with the previous matrix; 1 is nominal."
+            "New matrices. Loop gains: of the modes with the previous matrix, relative to the nominal gain."
         )
         parts.append(html.table(tables.Table(heads, lines), what))
     parts.append(html.note_list([f"after {one['seconds']:.0f} s: {one['text']}" for one in alarms], "bad"))
-    note = run.document.get("planted_note")
+    note = run.document.get("injected_note")
     parts.append(html.note_list([note] if note else []))
     return html.section("Tracking", *parts)
 
@@ -268,7 +265,9 @@ def _sky_time_section(run: RunContent) -> str:
         notes = run.document.get("notes") or []
         return html.section("Sky time", html.note_list(notes)) if notes else ""
     drawing = figures_registration.error_curves(curves)
-    realisations = f", rms over {curves['plants']} random plants" if "plants" in curves else ""
+    # Version 0.1.0 called them plants.
+    number = curves.get("realisations", curves.get("plants"))
+    realisations = f", rms over {number} random registrations" if number else ""
     caption = f"Error of the registration against the frames used{realisations}, with the Cramér-Rao bound."
     fewest_frames = curves.get("fewest_frames") or {}
     if fewest_frames:

@@ -26,12 +26,12 @@ PARAMETER_LABELS = {
 
 
 def colours(labels: Sequence[str]) -> dict[str, str]:
-    """A colour for every arm."""
+    """A colour for every variant."""
     return {label: style.SERIES[number % len(style.SERIES)] for number, label in enumerate(labels)}
 
 
 def strehl_scatter(sweep: Mapping[str, Any]) -> Figure:
-    """Strehl ratio of every loop against each parameter, by arm."""
+    """Strehl ratio of every loop against each parameter, by variant."""
     curves = sweep["curves"]
     keys = [key for key in next(iter(curves.values())) if key != "merit"]
     figure = style.new_figure(2.9 * len(keys) + 0.6, 3.4)
@@ -44,7 +44,7 @@ def strehl_scatter(sweep: Mapping[str, Any]) -> Figure:
             for label, values in curves.items()
             for value, merit in zip(values[key], np.array(values["merit"], float), strict=True)
         ]
-        # Shuffled, for the arms ran at the same parameters and the last drawn would cover the others.
+        # Shuffled, for the variants ran with the same parameters, and the last drawn would cover the others.
         order = np.random.default_rng(0).permutation(len(dots))
         values_shown, merits, colour = zip(*(dots[k] for k in order), strict=True)
         axes.scatter(values_shown, merits, s=5, lw=0, alpha=0.7, c=colour)
@@ -78,7 +78,7 @@ def importance(sweep: Mapping[str, Any]) -> Figure:
 
 
 def comparisons(rows: Sequence[Mapping[str, Any]], margin: float) -> Figure:
-    """Paired differences with their intervals, and the margin that does not matter."""
+    """Paired differences with their intervals, and the margin of equivalence."""
     figure = style.new_figure(7.4, 0.9 + 0.42 * len(rows))
     axes = style.style_axes(figure.subplots())
     axes.axvspan(-100 * margin, 100 * margin, color=style.SERIES[2], alpha=0.15, lw=0)
@@ -101,21 +101,19 @@ def sweep_section(document: Mapping[str, Any]) -> str:
     parts = []
     if document["best"]:
         caption = (
-            f"Every matrix at its own best parameters: mean over {loops['final'] // len(sweep['arms'])} "
-            f"stretches of air, the same for all, of {sweep['frames']} frames; standard errors over them."
+            f"Every matrix at its own best parameters: mean over {loops['final'] // len(sweep['curves'])} "
+            f"turbulence realisations, the same for all, of {sweep['frames']} frames; with standard errors."
         )
         parts.append(html.table(best_table(document), caption))
     if document["comparisons"]:
-        caption = (
-            "Paired differences at the best parameters with 95 % intervals. Shaded: what does not matter."
-        )
+        caption = "Paired differences at the best parameters with 95 % intervals. Shaded: equivalence margin."
         drawing = comparisons(document["comparisons"], sweep["margin"])
         parts.append(html.figure("sweepdiff", drawing, caption))
         parts.append(html.note_list([one["text"] for one in document["comparisons"]]))
     if sweep["importance"]:
         caption = (
             "Importance by functional analysis of variance. All loops: one that diverged counts with a "
-            "Strehl ratio of 0. Chance: what a parameter gets that does nothing."
+            "Strehl ratio of 0. Chance: the share of a dummy parameter without effect."
         )
         parts.append(html.figure("sweepimp", importance(sweep), caption))
     if loops["explore"]:
@@ -130,7 +128,7 @@ def sweep_section(document: Mapping[str, Any]) -> str:
 
 
 def best_table(document: Mapping[str, Any]) -> tables.Table:
-    """Three Strehl ratios and the best parameters of every arm."""
+    """Three Strehl ratios and the best parameters of every variant."""
     best = document["best"]
     keys = list(next(iter(best.values()))["values"]) if best else []
     headings = (

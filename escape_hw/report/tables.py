@@ -68,7 +68,7 @@ def format_percent(value: Estimate) -> str:
 
 
 def registration_table(
-    estimates: Mapping[str, RegistrationEstimate], planted: Registration | None = None
+    estimates: Mapping[str, RegistrationEstimate], injected: Registration | None = None
 ) -> Table:
     """Registration in the form of the paper's Table 1: components down, estimates across.
 
@@ -76,27 +76,27 @@ def registration_table(
     ----------
     estimates
         By column heading, such as ``SHORT``; an empty heading means alpha alone.
-    planted
+    injected
         The truth hidden in a twin, shown in a last column; beside each estimate then stands its
         difference from the truth over its standard error.
     """
-    return parameters_table({k: {**one.measured(), **one.extras} for k, one in estimates.items()}, planted)
+    return parameters_table({k: {**one.parameters(), **one.extras} for k, one in estimates.items()}, injected)
 
 
 def parameters_table(
-    estimates: Mapping[str, Mapping[str, Estimate]], planted: Registration | None = None
+    estimates: Mapping[str, Mapping[str, Estimate]], injected: Registration | None = None
 ) -> Table:
     """As :func:`registration_table`, of parameters by name with their errors."""
     headings = ["Component"]
     for label in estimates:
         headings.append(f"α {label}".strip())
-        if planted is not None:
+        if injected is not None:
             headings.append("Δ / σ")
-    if planted is not None:
-        headings.append("planted")
+    if injected is not None:
+        headings.append("injected")
     truth: dict[str, float] = {}
-    if planted is not None:
-        along, shear = planted.axis_scalings_and_shear
+    if injected is not None:
+        along, shear = injected.axis_scalings_and_shear
         truth = {**along.to_dict(), "anamorphosis": shear}
     rows = []
     for name in (name for name in TITLES if any(name in estimate for estimate in estimates.values())):
@@ -105,9 +105,9 @@ def parameters_table(
         for estimate in estimates.values():
             value = estimate.get(name)
             row.append("–" if value is None else format_with_error(value))
-            if planted is not None:
+            if injected is not None:
                 row.append("–" if value is None or name not in truth else _format_pull(value, truth[name]))
-        if planted is not None:
+        if injected is not None:
             row.append(f"{truth[name]:.4g}".replace("-", "−") if name in truth else "–")
         rows.append(tuple(row))
     return Table(tuple(headings), tuple(rows))

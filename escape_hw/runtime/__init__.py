@@ -1,4 +1,6 @@
-"""The ``System`` class of scripts, the procedures shared by command line and server, sweeps, and device tools.
+"""The ``System`` class of scripts.
+
+The procedures shared by command line and server, sweeps, and device tools.
 
 Numerics are in ``escape_hw.calibration``.
 """

@@ -147,10 +147,10 @@ class CommandGuard:
             See :meth:`validate`.
         """
         with np.errstate(all="ignore"):
-            wanted = self._validated(command)
-            if self.is_legal(wanted):
-                return _read_only(wanted), _UNCHANGED
-            legal, clipped, disabled, scale, removed = self._apply_static_limits(wanted)
+            requested = self._validated(command)
+            if self.is_legal(requested):
+                return _read_only(requested), _UNCHANGED
+            legal, clipped, disabled, scale, removed = self._apply_static_limits(requested)
             safe, slewed = self._apply_slew_limit(legal)
             return _read_only(safe), GuardReport(clipped, slewed, disabled, scale, removed)
 
@@ -209,27 +209,27 @@ class CommandGuard:
         CommandRejected
             See :meth:`validate`.
         """
-        wanted = self.validate(shape)
-        wanted[self._disabled] = 0.0
-        peak = _peak(wanted)
-        share = min(1.0, self.limits.max_stroke / peak) if peak > 0 else 1.0
-        return share * self._scale(wanted * share)
+        requested = self.validate(shape)
+        requested[self._disabled] = 0.0
+        peak = _peak(requested)
+        stroke_scale = min(1.0, self.limits.max_stroke / peak) if peak > 0 else 1.0
+        return stroke_scale * self._scale(requested * stroke_scale)
 
     def _validated(self, command: ArrayLike) -> NDArray[np.float64]:
-        asked = self._as_array(command)
-        if asked.dtype.kind not in "fiu":
+        array = self._as_array(command)
+        if array.dtype.kind not in "fiu":
             raise CommandRejected(
-                self.device, f"command has type {asked.dtype}; give real numbers, fractions of full stroke"
+                self.device, f"command has type {array.dtype}; give real numbers, fractions of full stroke"
             )
-        if asked.shape != (self.n_act,):
+        if array.shape != (self.n_act,):
             raise CommandRejected(
-                self.device, f"command has shape {asked.shape}; this mirror takes ({self.n_act},)"
+                self.device, f"command has shape {array.shape}; this mirror takes ({self.n_act},)"
             )
-        wanted = np.array(asked, dtype=np.float64, order="C")
+        requested = np.array(array, dtype=np.float64, order="C")
         # One pass: the sum of squares is not finite if any element is not.
-        if not math.isfinite(wanted.dot(wanted)):
-            self._require_finite(wanted)
-        return wanted
+        if not math.isfinite(requested.dot(requested)):
+            self._require_finite(requested)
+        return requested
 
     def _as_array(self, command: ArrayLike) -> NDArray[np.generic]:
         """Convert to an array; any failure becomes a :class:`CommandRejected`."""
@@ -244,12 +244,12 @@ class CommandGuard:
                 self.device, f"command is not an array of numbers ({type(command).__name__}: {error})"
             ) from error
 
-    def _require_finite(self, wanted: NDArray[np.float64]) -> None:
-        bad = np.flatnonzero(~np.isfinite(wanted))
+    def _require_finite(self, requested: NDArray[np.float64]) -> None:
+        bad = np.flatnonzero(~np.isfinite(requested))
         if bad.size:
             raise CommandRejected(
                 self.device,
-                f"actuator {bad[0]} is {wanted[bad[0]]} ({bad.size} of {self.n_act} not finite); "
+                f"actuator {bad[0]} is {requested[bad[0]]} ({bad.size} of {self.n_act} not finite); "
                 "the command is rejected and the last shape kept",
             )
 
@@ -257,7 +257,7 @@ class CommandGuard:
         return _peak(shape.take(self._first_of_pair) - shape.take(self._second_of_pair))
 
     def _apply_static_limits(
-        self, wanted: NDArray[np.float64]
+        self, requested: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], int, int, float, float]:
         """Bring a shape within every rule except slew.
 
@@ -266,8 +266,8 @@ class CommandGuard:
         legal, clipped, disabled, scale, mean_removed
         """
         lim = self.limits
-        disabled = int(np.count_nonzero(wanted[self._disabled]))
-        shape = _clamp(wanted, _MAX_MAGNITUDE)
+        disabled = int(np.count_nonzero(requested[self._disabled]))
+        shape = _clamp(requested, _MAX_MAGNITUDE)
         shape[self._disabled] = 0.0
         removed = 0.0
         if lim.max_mean is not None:

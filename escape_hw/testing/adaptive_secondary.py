@@ -140,13 +140,13 @@ def check_secondary_recovers_only_from_faults(factory: Factory) -> None:
     """``recover`` does nothing without a fault, and raises if the fault persists."""
     with open_device(factory) as mirror:
         state = mirror.state
-        asked: list[str] = []
-        with replace_hook(mirror, "_recover", lambda: asked.append("recover")):
+        calls: list[str] = []
+        with replace_hook(mirror, "_recover", lambda: calls.append("recover")):
             mirror.recover()
-            assert not asked, "recover() called the driver without a fault"
+            assert not calls, "recover() called the driver without a fault"
             with _reporting_fault(mirror):
                 assert_refused(mirror, DeviceError, "recovery from a fault that persists", mirror.recover)
-            assert asked, "recover() did not call the driver"
+            assert calls, "recover() did not call the driver"
         assert mirror.state is state, (
             f"recover() changed the state from {state} to {mirror.state} without a fault"
         )

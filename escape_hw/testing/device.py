@@ -107,7 +107,15 @@ def _calls_needing_open(device: Any) -> dict[str, Callable[[], object]]:
             "set_flat": lambda: device.set_flat([0.0]),
             "shape": lambda: device.shape,
         }
-        return uses | _secondary_calls_needing_open(device)
+        if isinstance(device, AdaptiveSecondary):
+            uses |= {
+                "state": lambda: device.state,
+                "health": lambda: device.health,
+                "measured_positions": device.measured_positions,
+                "go_to": lambda: device.go_to(ShellState.RESTED),
+                "recover": device.recover,
+            }
+        return uses
     if isinstance(device, Camera):
         return {"start": device.start, "next_frame": device.next_frame, "poll": device.poll}
     if isinstance(device, TipTiltModulator):
@@ -120,18 +128,6 @@ def _calls_needing_open(device: Any) -> dict[str, Callable[[], object]]:
     if isinstance(device, PhaseScreen):
         return {"set": device.set}
     return {"require_open": device.require_open}
-
-
-def _secondary_calls_needing_open(device: Any) -> dict[str, Callable[[], object]]:
-    if not isinstance(device, AdaptiveSecondary):
-        return {}
-    return {
-        "state": lambda: device.state,
-        "health": lambda: device.health,
-        "measured_positions": device.measured_positions,
-        "go_to": lambda: device.go_to(ShellState.RESTED),
-        "recover": device.recover,
-    }
 
 
 COMMON_CHECKS = checks_in(globals())

@@ -149,7 +149,12 @@ BROKEN: list[Broken] = [
     ("any region", SyntheticCamera, "camera_refuses_regions_off_the_sensor", {"check": takes_all}),
     ("any settings", SyntheticCamera, "camera_refuses_meaningless_settings", {"check": takes_all}),
     ("configure lies", SyntheticCamera, "camera_configure_reports_actual_settings", {"configure": lies}),
-    ("region ignored", SyntheticCamera, "camera_configure_reports_actual_settings", {"_configure": forgets_region}),
+    (
+        "region ignored",
+        SyntheticCamera,
+        "camera_configure_reports_actual_settings",
+        {"_configure": forgets_region},
+    ),
     ("stays stopped", SyntheticCamera, "camera_configures_while_running", {"configure": stays_stopped}),
     ("starts once", SyntheticCamera, "camera_start_and_stop_repeat", {"start": fails_twice}),
     ("keeps counting", SyntheticCamera, "camera_restart_resets_counters", {"start": keeps_counting}),

@@ -55,7 +55,12 @@ BROKEN: list[Broken] = [
         "construction_does_not_connect",
         {"__init__": lambda self: IdealPhaseScreen.__init__(self, "")},
     ),
-    ("overrides send", RecordingMirror, "final_methods_are_not_overridden", {"send": lambda self, c: self._send(c)}),
+    (
+        "overrides send",
+        RecordingMirror,
+        "final_methods_are_not_overridden",
+        {"send": lambda self, c: self._send(c)},
+    ),
     ("opens once", IdealPhaseScreen, "open_and_close_repeat", {"_open": refuses_to_reopen}),
     ("swallows errors", IdealPhaseScreen, "context_manager", {"__exit__": swallows}),
     ("works while closed", IdealPhaseScreen, "refuses_use_unless_open", {"set": sets_anyway}),

@@ -70,7 +70,12 @@ BROKEN: list[Broken] = [
     ("brags of its reach", QuantisedModulator, "modulator_info", {"info": property(brags)}),
     ("check moves", QuantisedModulator, "modulator_check_changes_nothing", {"_check": checks_by_moving}),
     ("any modulation", QuantisedModulator, "modulator_refuses_meaningless", {"check": takes_all}),
-    ("modulate lies", QuantisedModulator, "modulator_reports_actual_modulation", {"modulate": modulates_as_asked}),
+    (
+        "modulate lies",
+        QuantisedModulator,
+        "modulator_reports_actual_modulation",
+        {"modulate": modulates_as_asked},
+    ),
     ("does not park", QuantisedModulator, "modulator_parks", {"_park": lambda self: None}),
     (
         "closes moving",

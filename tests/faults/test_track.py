@@ -269,11 +269,11 @@ def test_the_command_leaves_table_matrix_and_report(start, tmp_path, capsys):
     assert document["alarms"] == []
     assert set(document["registration"]) == set(PARAMETERS)
     assert len(document["track"]["seconds"]) == 3
-    planted, seconds = document["planted_course"]["shift_x"], document["track"]["seconds"]
+    injected, seconds = document["injected_course"]["shift_x"], document["track"]["seconds"]
     # The drift began when the bench was switched on, so the twin's clock counts.
-    np.testing.assert_allclose(np.diff(planted), np.diff(seconds), rtol=1e-6)
-    assert abs(planted[-1] - document["track"]["shift_x"][-1]) < 3.0
-    assert document["planted_end"]["shift_x"] == planted[-1]
+    np.testing.assert_allclose(np.diff(injected), np.diff(seconds), rtol=1e-6)
+    assert abs(injected[-1] - document["track"]["shift_x"][-1]) < 3.0
+    assert document["injected_end"]["shift_x"] == injected[-1]
     assert len(document["optical_gain"]) == start.matrix.n_modes
     lines = (tmp_path / "run" / "track.csv").read_text().splitlines()
     assert lines[0].split(",")[:2] == ["seconds", "shift_x"]

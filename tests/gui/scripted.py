@@ -201,7 +201,8 @@ class ScriptedSource:
         """Add an entry to every stream that the panels read."""
         rng = np.random.default_rng(seed)
         n_slopes = 2 * sum(row.count("1") for row in self.geometry_data.valid)
-        n_act = sum(row.count("1") for row in self.geometry_data.layout) or len(self.geometry_data.positions_m)
+        geometry = self.geometry_data
+        n_act = sum(row.count("1") for row in geometry.layout) or len(geometry.positions_m)
         self.push("frames", spots(self.geometry_data, seed=seed), top=1023.0)
         self.push("slopes", rng.normal(0, 0.4, n_slopes))
         self.push("commands", rng.normal(0, 0.1, n_act))

@@ -28,6 +28,7 @@ from escape_gui.widgets.controls.status_indicator import Level
 from escape_gui.widgets.images.image_viewer import ImageViewer
 from escape_gui.window.header import HeaderBar
 from escape_gui.window.workspaces import WORKSPACES
+from escape_hw.config.loader import load_system
 from escape_hw.remote.source import DataSource
 from escape_hw.remote.state import (
     DeviceHealth,
@@ -37,6 +38,7 @@ from escape_hw.remote.state import (
     ProcedureEntry,
     ProcedureParameter,
 )
+from escape_hw.server.engine.procedures import ProcedureRegistry
 
 MakeWindow = Callable[..., MainWindow]
 
@@ -172,6 +174,27 @@ def test_the_form_and_its_result_have_room(make_window: MakeWindow, source: Scri
         )
         assert unit.geometry().left() - field.geometry().right() > 8
         assert field.width() >= 60
+
+
+@pytest.mark.parametrize("system", ["razor-shwfs", "razor-pywfs"])
+def test_the_forms_of_all_procedures_fit(
+    make_window: MakeWindow, source: ScriptedSource, system: str
+) -> None:
+    """At 1280 x 800 no label is so long that fields or units are cut off."""
+    source.entries = ProcedureRegistry(load_system(system)).entries
+    window = make_window(settings=Settings(workspace="calibrate"))
+    panel = window.panels["procedure"]
+    assert isinstance(panel, ProcedurePanel)
+    too_wide = []
+    for k in range(panel.choice.count()):
+        panel.choice.setCurrentIndex(k)
+        window.update_timer.tick(force=True)
+        QApplication.processEvents()
+        area = panel.form._area
+        if area.widget().minimumSizeHint().width() > area.viewport().width():
+            too_wide.append(panel.choice.itemText(k))
+    assert panel.choice.count() > 5
+    assert too_wide == []
 
 
 def test_a_notification_covers_no_panel(

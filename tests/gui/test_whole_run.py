@@ -15,7 +15,7 @@ from escape_hw.remote.state import Finish, FinishedRun
 
 
 def injected(ended: FinishedRun) -> Registration:
-    return Registration(**ended.document["planted"])
+    return Registration(**ended.document["injected"])
 
 
 def recovered(ended: FinishedRun) -> None:

@@ -15,7 +15,7 @@ SMALL = (
     "devices.screen.screen=2", "basis.n_modes=25", "calibration.sprint_modes=25", "loop.dropped_modes=4",
     "twin.wfs.photons_per_frame=2.5e6", "twin.mirror.wing_fraction=0", "twin.mirror.gain_scatter=0.02",
 )  # fmt: skip
-PLANTED = np.array([-16.0, -71.0, -0.77, 2.9, 0.0])
+INJECTED = np.array([-16.0, -71.0, -0.77, 2.9, 0.0])
 #: What counts as found, in the units of the parameters, on sub-apertures twice as wide as the bench's.
 NEAR = np.array([1.0, 1.0, 0.1, 0.3, 0.3])
 
@@ -25,7 +25,7 @@ def calibrated(*more: str, frames: int = 400, estimator: str = "auto") -> Calibr
         result = bench.calibrate(frames=frames, estimator=estimator)
     assert result.registration is not None
     assert result.registration.converged, result.registration.warnings
-    errors = result.registration.registration.to_array() - PLANTED
+    errors = result.registration.registration.to_array() - INJECTED
     assert (np.abs(errors) < np.maximum(NEAR, 4 * result.registration.sigma)).all(), errors
     assert (result.registration.sigma < 3 * NEAR).all()
     return result

@@ -1,4 +1,4 @@
-"""What SPRINT fits beside the registration, against planted truths: there, and not there."""
+"""What SPRINT fits beside the registration, against injected values: there, and not there."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def model(request):
     return make_fast_model(SYSTEMS[request.param](), None)
 
 
-def plant(seed: int) -> Registration:
+def realisation(seed: int) -> Registration:
     rng = np.random.default_rng(seed)
     return Registration.from_array(rng.uniform(-1, 1, 5) * [20, 20, 0.5, 1.5, 1.5])
 
@@ -65,9 +65,9 @@ def test_a_shear_and_its_axes_are_the_same_stretch(shear):
 def test_a_shear_is_recovered_within_its_error(model):
     pulls, blind = [], []
     for seed in SEEDS:
-        truth = plant(seed)
+        truth = realisation(seed)
         matrix = noisy(model.zonal_matrix(truth.with_shear(SHEAR)), model, seed)
-        found = sprint(matrix, model, also=("anamorphosis",))
+        found = sprint(matrix, model, extra_parameters=("anamorphosis",))
         assert found.converged, found.warnings
         shear = found.extras["anamorphosis"]
         assert shear.sigma < 0.2 * SHEAR
@@ -82,9 +82,9 @@ def test_a_shear_is_recovered_within_its_error(model):
 def test_where_there_is_no_shear_asking_for_one_does_no_harm(model):
     pulls, wider = [], []
     for seed in SEEDS:
-        truth = plant(seed)
+        truth = realisation(seed)
         matrix = noisy(model.zonal_matrix(truth), model, seed)
-        plain, found = sprint(matrix, model), sprint(matrix, model, also=("anamorphosis",))
+        plain, found = sprint(matrix, model), sprint(matrix, model, extra_parameters=("anamorphosis",))
         shear = found.extras["anamorphosis"]
         pulls.append(shear.value / shear.sigma)
         assert (np.abs(errors(found, truth)) < 4.5 * found.sigma).all()
@@ -94,7 +94,7 @@ def test_where_there_is_no_shear_asking_for_one_does_no_harm(model):
 
 
 def test_a_shear_is_in_the_pseudo_synthetic_matrix(model):
-    truth = plant(1)
+    truth = realisation(1)
     with_shear = model.zonal_matrix(truth.with_shear(SHEAR))
     matrix = noisy(with_shear, model, 1)
 
@@ -102,14 +102,18 @@ def test_a_shear_is_in_the_pseudo_synthetic_matrix(model):
         made, _ = compute_pseudo_synthetic_matrix(model, estimate, np.eye(model.n_act))
         return np.square(made - with_shear).sum() / np.square(with_shear).sum()
 
-    assert missed(sprint(matrix, model, also=("anamorphosis",))) < 0.2 * missed(sprint(matrix, model))
+    assert missed(sprint(matrix, model, extra_parameters=("anamorphosis",))) < 0.2 * missed(
+        sprint(matrix, model)
+    )
 
 
 def test_a_shear_stays_with_a_mirror_that_moves_on(model):
     """As for a tracker, which follows the registration alone."""
-    truth, basis = plant(1), np.eye(model.n_act)
+    truth, basis = realisation(1), np.eye(model.n_act)
     found = sprint(
-        noisy(model.zonal_matrix(truth.with_shear(SHEAR)), model, 1), model, also=("anamorphosis",)
+        noisy(model.zonal_matrix(truth.with_shear(SHEAR)), model, 1),
+        model,
+        extra_parameters=("anamorphosis",),
     )
     there = Registration.from_array(found.registration.to_array() + np.array([8.0, -5.0, 0.2, 0.0, 0.0]))
     with_shear = model.zonal_matrix(there.with_shear(found.extras["anamorphosis"].value), found.width.value)
@@ -126,9 +130,9 @@ def test_shifted_pupil_images_are_told_from_a_shifted_mirror_by_their_rims():
     model = make_fast_model(config, None)
     pulls = []
     for seed in SEEDS:
-        truth, moved = plant(seed), np.random.default_rng(seed).uniform(-15, 15, 2)
+        truth, moved = realisation(seed), np.random.default_rng(seed).uniform(-15, 15, 2)
         matrix = noisy(model.with_pupil_shift(*moved).zonal_matrix(truth), model, seed)
-        found = sprint(matrix, model, also=("pupil_shift",))
+        found = sprint(matrix, model, extra_parameters=("pupil_shift",))
         assert found.converged, found.warnings
         shift = [found.extras[name] for name in ("pupil_shift_x", "pupil_shift_y")]
         own = [(one.value - there) / one.sigma for one, there in zip(shift, moved, strict=True)]
@@ -138,12 +142,12 @@ def test_shifted_pupil_images_are_told_from_a_shifted_mirror_by_their_rims():
     assert np.abs(pulls).max() < 5
 
 
-def test_on_the_twin_a_planted_shear_is_found_and_told():
+def test_on_the_twin_a_injected_shear_is_found_and_told():
     pulls = []
     for seed in (1, 2, 3):
         leaning = Registration(-16.0, -71.0, -0.77, 2.9, 0.0).with_shear(SHEAR)
-        planted = [f"twin.registration.{name}={value!r}" for name, value in leaning.to_dict().items()]
-        config = small_lenslets(*planted, 'calibration.extra_parameters=["anamorphosis"]', seed=seed)
+        injected = [f"twin.registration.{name}={value!r}" for name, value in leaning.to_dict().items()]
+        config = small_lenslets(*injected, 'calibration.extra_parameters=["anamorphosis"]', seed=seed)
         with System.from_config(config) as bench:
             found = bench.calibrate(frames=400).registration
         shear = found.extras["anamorphosis"]
@@ -156,8 +160,8 @@ def test_on_the_twin_a_planted_shear_is_found_and_told():
 def test_what_a_model_or_solver_does_not_know_is_refused():
     model = make_fast_model(small_lenslets(), None)
     matrix = noisy(model.zonal_matrix(Registration()), model, 0)
-    with pytest.raises(ConfigError, match="knows no shift of the pupil"):
-        sprint(matrix, model, also=("pupil_shift",))
-    with pytest.raises(ConfigError, match="takes solver = 'mixed-effects'"):
-        sprint(matrix, model, also=("anamorphosis",), solver="registration-only")
+    with pytest.raises(ConfigError, match="has no shift of the pupil"):
+        sprint(matrix, model, extra_parameters=("pupil_shift",))
+    with pytest.raises(ConfigError, match="needs solver = 'mixed-effects'"):
+        sprint(matrix, model, extra_parameters=("anamorphosis",), solver="registration-only")
     assert not sprint(matrix, model).extras

@@ -1,4 +1,4 @@
-"""The pseudo-synthetic matrix of a mirror with unequal actuators, against the mirror that was planted."""
+"""The pseudo-synthetic matrix of a mirror with unequal actuators, against the mirror that was injected."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from escape_sim.models.factory import make_fast_model
 from escape_sim.models.pyramid import PyramidModel, nominal_pupils
 from escape_sim.models.shack_hartmann import nominal_grid
 
-PLANTED = Registration(-16.0, 31.0, -0.77, 1.9, 0.5)
+INJECTED = Registration(-16.0, 31.0, -0.77, 1.9, 0.5)
 SEEDS = range(4)
 
 
@@ -57,12 +57,12 @@ def design(request: pytest.FixtureRequest) -> Design:
     return made()
 
 
-def planted(design: Design, seed: int, pedestal: float = 0.02) -> np.ndarray:
+def injected(design: Design, seed: int, pedestal: float = 0.02) -> np.ndarray:
     """Slopes per command of a mirror whose actuators differ, and behind unequal slopes."""
     model, rng = design.model, np.random.default_rng(seed)
     gains, widths = rng.normal(1, 0.05, model.n_act), rng.normal(1.04, 0.03, model.n_act)
-    zonal = np.stack([model.zonal_matrix(PLANTED, w)[:, a] for a, w in enumerate(widths)], axis=1)
-    broad = np.stack([model.zonal_matrix(PLANTED, PEDESTAL * w)[:, a] for a, w in enumerate(widths)], axis=1)
+    zonal = np.stack([model.zonal_matrix(INJECTED, w)[:, a] for a, w in enumerate(widths)], axis=1)
+    broad = np.stack([model.zonal_matrix(INJECTED, PEDESTAL * w)[:, a] for a, w in enumerate(widths)], axis=1)
     return np.asarray(((1 - pedestal) * zonal + pedestal * broad) * gains)
 
 
@@ -85,7 +85,7 @@ def compared(design: Design, noise: float, m2c: np.ndarray | None = None) -> np.
     """Errors ``(n_seeds, 2)`` of the matrix of the found mirror, and of alike actuators."""
     errors, basis = [], design.m2c if m2c is None else m2c
     for seed in SEEDS:
-        zonal = planted(design, seed)
+        zonal = injected(design, seed)
         estimate = sprint(measured(design, zonal, noise, seed), design.model, update_priors=True)
         made = [
             compute_pseudo_synthetic_matrix(design.model, one, basis)[0]
@@ -103,10 +103,10 @@ def test_a_well_measured_mirror_is_found(design: Design) -> None:
 def test_a_mirror_on_a_large_pedestal_is_found(design: Design) -> None:
     errors = []
     for seed in SEEDS:
-        zonal = planted(design, seed, 0.4)
+        zonal = injected(design, seed, 0.4)
         estimate = sprint(measured(design, zonal, 0.1, seed), design.model, update_priors=True)
         assert estimate.converged, estimate.warnings
-        off = estimate.registration.to_array() - PLANTED.to_array()
+        off = estimate.registration.to_array() - INJECTED.to_array()
         assert (np.abs(off) < 4 * np.sqrt(np.diag(estimate.covariance))).all()
         made = compute_pseudo_synthetic_matrix(design.model, estimate, design.m2c)[0]
         errors.append(missed(made, zonal @ design.m2c))
@@ -128,7 +128,7 @@ def test_the_matrix_holds_for_modes_that_were_never_poked(design: Design) -> Non
 
 
 def test_departures_belong_to_actuators_and_not_to_modes(design: Design) -> None:
-    zonal = planted(design, 0)
+    zonal = injected(design, 0)
     estimate = sprint(measured(design, zonal, 0.1, 0), design.model)
     turn = np.random.default_rng(2).standard_normal((design.m2c.shape[1], 5))
     made, turned = (
@@ -139,7 +139,7 @@ def test_departures_belong_to_actuators_and_not_to_modes(design: Design) -> None
 
 
 def test_its_errors_know_of_single_actuators(design: Design) -> None:
-    zonal = planted(design, 0)
+    zonal = injected(design, 0)
     estimate = sprint(measured(design, zonal, 1.0, 0), design.model, update_priors=True)
     made, sigma = compute_pseudo_synthetic_matrix(design.model, estimate, design.m2c)
     scale = float(np.vdot(made, zonal @ design.m2c) / np.vdot(made, made))
@@ -152,9 +152,9 @@ def test_its_errors_know_of_single_actuators(design: Design) -> None:
 
 
 def test_alike_is_the_matrix_of_the_drawing(design: Design) -> None:
-    matrix = measured(design, planted(design, 0), 0.1, 0)
+    matrix = measured(design, injected(design, 0), 0.1, 0)
     found = sprint(matrix, design.model)
-    alike = sprint(matrix, design.model, actuators="nominal")
+    alike = sprint(matrix, design.model, actuator_model="nominal")
     assert found.actuator_corrections is not None
     assert alike.actuator_corrections is None
     np.testing.assert_array_equal(alike.registration.to_array(), found.registration.to_array())

@@ -1,4 +1,4 @@
-"""The live registration against planted truths, in closed loop with small pokes."""
+"""The live registration against injected values, in closed loop with small pokes."""
 
 from __future__ import annotations
 
@@ -39,18 +39,19 @@ def looked(
     bench.run(loop.run(300, observe=[lambda *frame: slope_statistics.add(frame[1])]))
     c = bench.config.calibration
     live = LiveRegistration(
-        start.matrix, bench.model(slope_statistics.annotate_geometry(start.grid, closed=True)), start.registration,
-        order=c.whiten_order, lags=c.lags, memory=memory, n_curve_coefficients=n_curve_coefficients, response=start.response,
+        start.matrix, bench.model(slope_statistics.annotate_geometry(start.grid, closed=True)),
+        start.registration, order=c.whiten_order, lags=c.lags, memory=memory,
+        n_curve_coefficients=n_curve_coefficients, response=start.response,
         step_s=frames / bench.wfs.settings.frame_rate_hz,
     )  # fmt: skip
-    tape = TelemetryBuffer(start.grid.n_slopes, start.matrix.n_modes, frames, live.memory_rows)
+    buffer = TelemetryBuffer(start.grid.n_slopes, start.matrix.n_modes, frames, live.memory_rows)
     for _ in range(blocks):
         bench.run(
             loop.run(
-                frames, inject=lambda: amplitude * bench.rng.uniform(-1, 1, amplitude.size), observe=[tape]
+                frames, inject=lambda: amplitude * bench.rng.uniform(-1, 1, amplitude.size), observe=[buffer]
             )
         )
-        found = live.update(*tape.take_block())
+        found = live.update(*buffer.take_block())
     bench.dm.flatten()
     return found, start
 
@@ -60,13 +61,13 @@ def errors_and_pulls(found, truth):
     return errors, errors / found.registration.sigma
 
 
-def plant(number):
+def realisation(number):
     return open_system(SYSTEM, set=registration_overrides(random_registration(number)), seed=number + 1)
 
 
 def test_a_thousand_frames_in_closed_loop_at_small_pokes():
     """1 % of a sub-aperture, 0.02 degrees, 0.1 %: pokes of 0.2 % of the stroke."""
-    with plant(0) as bench:
+    with realisation(0) as bench:
         errors, pulls = errors_and_pulls(looked(bench, 2, 500)[0], random_registration(0))
     assert (np.abs(errors) <= 2 * GOAL).all(), errors
     assert np.abs(pulls).max() < 4
@@ -87,7 +88,7 @@ def test_any_controller_gives_the_same(number, gain):
 @pytest.mark.slow
 def test_the_matrix_it_fits_answers_as_the_bench_does():
     """Held against push-pull without turbulence, whose spots are a little smaller."""
-    with plant(2) as bench:
+    with realisation(2) as bench:
         found, start = looked(bench, 2, 500)
         calm = bench.calibrate("push-pull", grid=start.grid).matrix
     share = np.vdot(calm.data, found.matrix) / np.vdot(calm.data, calm.data)
@@ -106,11 +107,11 @@ def test_the_pyramid_has_gains_by_mode():
     assert np.ptp(found.gains) > 0
 
 
-def planted(truth, *more, seed):
+def injected(truth, *more, seed):
     """The small bench with a mirror that is seen askew, too."""
     leaning = truth.with_shear(SHEAR).to_dict()
-    plants = (f"twin.registration.{name}={value!r}" for name, value in leaning.items())
-    return System.from_config(configuration(*plants, *more, seed=seed))
+    realisations = (f"twin.registration.{name}={value!r}" for name, value in leaning.items())
+    return System.from_config(configuration(*realisations, *more, seed=seed))
 
 
 def test_a_sheared_mirror_does_not_lean_the_registration():
@@ -118,7 +119,7 @@ def test_a_sheared_mirror_does_not_lean_the_registration():
     missed, blind = [], []
     for number in (1, 3):
         truth = random_registration(number)
-        with planted(truth, 'calibration.extra_parameters=["anamorphosis"]', seed=number) as bench:
+        with injected(truth, 'calibration.extra_parameters=["anamorphosis"]', seed=number) as bench:
             found, start = looked(bench, 4, 500)
         errors, pulls = errors_and_pulls(found, truth)
         missed.append(errors[:2])
@@ -126,7 +127,7 @@ def test_a_sheared_mirror_does_not_lean_the_registration():
         shear, before = found.registration.extras["anamorphosis"], start.registration.extras["anamorphosis"]
         assert abs(shear.value - before.value) < 3 * before.sigma
         assert shear.value == pytest.approx(SHEAR, abs=0.15)
-        with planted(truth, seed=number) as bench:
+        with injected(truth, seed=number) as bench:
             plain = looked(bench, 4, 500)[0]
         blind.append(errors_and_pulls(plain, truth)[0][:2])
         assert found.misfit < plain.misfit
@@ -156,10 +157,10 @@ def test_too_few_frames_are_refused():
 
 
 @pytest.mark.slow
-def test_twelve_plants():
+def test_twelve_realisations():
     errors, pulls = [], []
     for number in range(12):
-        with plant(number) as bench:
+        with realisation(number) as bench:
             e, p = errors_and_pulls(looked(bench, 2, 500)[0], random_registration(number))
         errors.append(e)
         pulls.append(p)

@@ -138,7 +138,7 @@ def test_bootstrap_converges_from_any_scale_to_the_same_matrix(
                 scaled(opened, factor),
                 accuracy=0.03,
                 frames=5000,
-                beside={"baseline": baseline.matrix},
+                comparisons={"baseline": baseline.matrix},
             )
         )
         result = run.result
@@ -150,7 +150,7 @@ def test_bootstrap_converges_from_any_scale_to_the_same_matrix(
         assert result.rounds[-1].strehl_loss <= 0.01 * (1 + 1e-9)
         # The loop was closed from below: nothing tried was unstable.
         assert all(step.stable for step in result.closure)
-        gains, beside = gains_of(run), result.beside["baseline"]
+        gains, beside = gains_of(run), result.comparisons["baseline"]
         assert np.median(gains.best) * factor > 1
         assert 0.5 < np.median(beside.best) < 1
         levels[factor] = np.abs(run.rescaled_calibration.matrix.data).mean(axis=0)
@@ -193,7 +193,7 @@ def test_numbers_that_mean_nothing_and_strangers_are_refused(
         baseline.matrix, data=baseline.matrix.data[keep], sigma=baseline.matrix.sigma[keep], valid=valid
     )
     with pytest.raises(IncompatibleProduct, match="pp was measured on other"):
-        bench.run(bootstrap_gains(bench, baseline, beside={"pp": stranger}))
+        bench.run(bootstrap_gains(bench, baseline, comparisons={"pp": stranger}))
 
 
 def test_the_command_keeps_gains_and_matrix(
@@ -206,7 +206,8 @@ def test_the_command_keeps_gains_and_matrix(
     im = save_matrix(tmp_path / "pp.fits", baseline, BenchRecord.from_bench(bench).origin())
     words = [word for one in (*SMALL, DIM) for word in ("--set", one)]
     out = tmp_path / "run"
-    options = ["--frames", "900", "--accuracy", "0.2", "--no-strehl", "--out", out, "--beside", im, "--json"]
+    options = ["--frames", "900", "--accuracy", "0.2", "--no-strehl", "--out", out]
+    options += ["--other-matrices", im, "--json"]
     with pytest.raises(SystemExit) as ended:
         run([str(word) for word in ("gains", "razor-pywfs", "--im", im, *options, *words)])
     document = json.loads(capsys.readouterr().out)
@@ -231,14 +232,19 @@ def test_another_matrix_lends_its_shape(
     shape = scaled(baseline, 2.0).matrix
     run = bench.run(
         bootstrap_gains(
-            bench, opened, accuracy=0.2, frames=900, shape=shape, beside={"baseline": baseline.matrix}
+            bench,
+            opened,
+            accuracy=0.2,
+            frames=900,
+            closed_loop_matrix=shape,
+            comparisons={"baseline": baseline.matrix},
         )
     )
-    assert list(run.result.beside) == ["baseline"]
+    assert list(run.result.comparisons) == ["baseline"]
     share = run.rescaled_calibration.matrix.data / baseline.matrix.data
     # Half the gain of the same matrix at half the size.
     np.testing.assert_allclose(
-        np.median(share, axis=0), np.maximum(run.result.beside["baseline"].best, 0.15), rtol=1e-3
+        np.median(share, axis=0), np.maximum(run.result.comparisons["baseline"].best, 0.15), rtol=1e-3
     )
     assert np.median(gains_of(run).best) > 1
 

@@ -1,4 +1,4 @@
-"""The registration against planted truths that the estimators never see."""
+"""The registration against injected values that the estimators never see."""
 
 from __future__ import annotations
 
@@ -30,17 +30,17 @@ def _meets_goal(curves: dict[str, Any], estimator: str, frames: int) -> bool:
 
 @pytest.fixture(scope="module")
 def few() -> list[RealisationErrors]:
-    """Three plants, all imperfections on, 0.6 seconds of frames each."""
+    """Three registrations, all imperfections on, 0.6 seconds of frames each."""
     return [run_realisation(SYSTEM, number, (300,)) for number in (0, 1, 2)]
 
 
-def test_plants_fill_their_ranges_and_differ() -> None:
-    plants = np.array([random_registration(n).to_array() for n in range(200)])
-    assert (np.abs(plants) <= HALF_RANGES).all()
-    assert (plants.std(axis=0) > 0.5 * HALF_RANGES).all()
+def test_registrations_fill_their_ranges_and_differ() -> None:
+    drawn = np.array([random_registration(n).to_array() for n in range(200)])
+    assert (np.abs(drawn) <= HALF_RANGES).all()
+    assert (drawn.std(axis=0) > 0.5 * HALF_RANGES).all()
 
 
-def test_three_hundred_frames_meet_the_goal_on_every_plant(few: Sequence[RealisationErrors]) -> None:
+def test_three_hundred_frames_meet_the_goal_on_every_registration(few: Sequence[RealisationErrors]) -> None:
     curves = summary(few, (300,))
     assert _meets_goal(curves, "whitened", 300)
     assert curves["fewest_frames"]["whitened"] == 300
@@ -67,9 +67,9 @@ def test_no_estimate_beats_the_bound_and_none_claims_to(few: Sequence[Realisatio
 
 
 @pytest.mark.slow
-def test_thirty_plants_short_and_two_seconds() -> None:
+def test_thirty_registrations_short_and_two_seconds() -> None:
     """The paper's SHORT run and a tenth of it: accurate, and honest about it in every parameter."""
-    curves = run(sky_time(SYSTEM, plants=30, frames=(1000, 10_000)))
+    curves = run(sky_time(SYSTEM, realisations=30, frames=(1000, 10_000)))
     for estimator in ("whitened", "telemetry"):
         for frames in (1000, 10_000):
             assert _meets_goal(curves, estimator, frames)

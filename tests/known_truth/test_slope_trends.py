@@ -1,4 +1,4 @@
-"""Slopes of a pyramid that answer more towards the rim than its model says, against planted truths."""
+"""Slopes of a pyramid that answer more towards the rim than its model says, against injected values."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def error_of(fit: SprintFit, truth: Registration) -> NDArray[np.float64]:
     return fit.estimate.registration.to_array() - truth.to_array()
 
 
-def test_a_planted_trend_is_found(model: PyramidModel) -> None:
+def test_a_injected_trend_is_found(model: PyramidModel) -> None:
     pulls, shapes = [], []
     terms = np.column_stack([np.ones(len(unit_trends(model))), unit_trends(model)])
     for seed in SEEDS:
@@ -138,8 +138,8 @@ def test_the_noise_that_lenslets_share_is_left_as_it_was() -> None:
     sigma = 0.1 * zonal_matrix.std()
     data = zonal_matrix + sigma * rng.standard_normal((1, lenslets.n_act))
     matrix = InteractionMatrix(
-        data.astype(np.float32), np.full(zonal_matrix.shape, sigma, np.float32), np.eye(lenslets.n_act), grid.valid,
-        "razor-shwfs", "docrime", True,
+        data.astype(np.float32), np.full(zonal_matrix.shape, sigma, np.float32), np.eye(lenslets.n_act),
+        grid.valid, "razor-shwfs", "docrime", True,
     )  # fmt: skip
     estimate_priors = run(fit_registration(matrix, lenslets)).estimate_priors
     assert estimate_priors is not None

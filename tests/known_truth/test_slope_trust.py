@@ -31,17 +31,17 @@ class Selective:
         return getattr(self._model, name)
 
 
-def soiled(pupils: PyramidPupils) -> NDArray[np.bool_]:
+def contaminated(pupils: PyramidPupils) -> NDArray[np.bool_]:
     """Valid pixels in the outer fifth of a quarter of the pupil ``(n_valid,)``."""
     y, x = (np.argwhere(pupils.valid) + 0.5 - len(pupils.valid) / 2).T
     return (np.hypot(x, y) > 0.4 * len(pupils.valid)) & (x > np.abs(y))
 
 
 def errors(selective: bool, solver: Solver = "mixed-effects") -> NDArray[np.float64]:
-    """Errors ``(6, 5)`` on plants whose soiled pixels answer by half to what their neighbours see."""
+    """Errors ``(6, 5)`` for contaminated pixels with half the response of their neighbours."""
     config = small_pyramid()
     pupils = nominal_pupils(config)
-    model, dirty = PyramidModel(config, pupils), np.tile(soiled(pupils), 2)
+    model, dirty = PyramidModel(config, pupils), np.tile(contaminated(pupils), 2)
     trust = np.where(dirty, 1e-3, 1.0)
     out = []
     for seed in range(6):
@@ -66,7 +66,7 @@ def errors(selective: bool, solver: Solver = "mixed-effects") -> NDArray[np.floa
 @pytest.mark.parametrize("solver", ["mixed-effects", "registration-only", "frozen-derivatives"])
 def test_slopes_that_are_not_trusted_do_not_move_the_registration(solver: Solver) -> None:
     with_all, without = (np.sqrt(np.mean(np.square(errors(one, solver)), axis=0)) for one in (False, True))
-    # Scaling along x, the way the soiled pixels look; a clean fit errs by some hundredths of a per cent.
+    # Scaling along x, the way the contaminated pixels look; a clean fit errs by hundredths of a per cent.
     assert with_all[3] > 0.3
     assert without[3] < with_all[3] / 4
     assert without[0] < with_all[0]
@@ -77,10 +77,10 @@ def test_only_a_telescopes_model_distrusts_dim_pixels(system: str, telescope: bo
     config = load_system(system, overrides=["sensor.n_sub=24", "basis.n_modes=20"])
     pupils = nominal_pupils(config)
     arc = np.zeros(pupils.valid.shape, bool)
-    arc[pupils.valid] = soiled(pupils)
+    arc[pupils.valid] = contaminated(pupils)
     model = PyramidModel(config, replace(pupils, flux=np.where(arc, 0.4, 1.0).astype(np.float32)))
     trusted = model.slope_weights == 1.0
-    expected = ~soiled(pupils) if telescope else np.ones(pupils.valid.sum(), bool)
+    expected = ~contaminated(pupils) if telescope else np.ones(pupils.valid.sum(), bool)
     np.testing.assert_array_equal(trusted, np.tile(expected, 2))
     assert (model.slope_weights > 0).all()
 

@@ -48,7 +48,7 @@ def matrix_at(model: ShackHartmannModel) -> Callable[[Registration], Interaction
 
 
 @pytest.mark.parametrize(
-    "planted",
+    "injected",
     [
         Registration(shift_x=-200.0, shift_y=150.0),
         Registration(rotation=10.0),
@@ -56,20 +56,22 @@ def matrix_at(model: ShackHartmannModel) -> Callable[[Registration], Interaction
     ],
     ids=str,
 )
-def test_finds_home_from_afar(model, matrix_at, planted):
-    estimate = sprint(matrix_at(planted), model)
+def test_finds_home_from_afar(model, matrix_at, injected):
+    estimate = sprint(matrix_at(injected), model)
     assert estimate.converged
-    error = estimate.registration.to_array() - planted.to_array()
+    error = estimate.registration.to_array() - injected.to_array()
     assert (np.abs(error) < [0.5, 0.5, 0.02, 0.1, 0.1]).all()
     assert estimate.chi2 == pytest.approx(1.0, abs=0.1)
 
 
 def test_a_shift_by_more_than_a_pitch_is_not_passed_off_as_found(model, matrix_at):
-    planted = Registration(shift_x=400.0)
-    estimate = sprint(matrix_at(planted), model, max_iterations=10, coarse_search=False)
+    injected = Registration(shift_x=400.0)
+    estimate = sprint(matrix_at(injected), model, max_iterations=10, coarse_search=False)
     assert not estimate.converged
     assert any("explains" in warning for warning in estimate.warnings)
-    assert sprint(matrix_at(planted), model, start=Registration(shift_x=300.0), coarse_search=False).converged
+    assert sprint(
+        matrix_at(injected), model, start=Registration(shift_x=300.0), coarse_search=False
+    ).converged
 
 
 def random_far(number):
@@ -84,11 +86,11 @@ def random_far(number):
 @pytest.mark.parametrize("solver", ["registration-only", "mixed-effects"])
 def test_two_pitches_away_turned_and_scaled(model, matrix_at, solver):
     for number in range(4):
-        planted = random_far(number)
-        estimate = sprint(matrix_at(planted), model, solver=solver)
-        assert estimate.converged, planted
-        error = estimate.registration.to_array() - planted.to_array()
-        assert (np.abs(error) < 5 * estimate.sigma).all(), planted
+        injected = random_far(number)
+        estimate = sprint(matrix_at(injected), model, solver=solver)
+        assert estimate.converged, injected
+        error = estimate.registration.to_array() - injected.to_array()
+        assert (np.abs(error) < 5 * estimate.sigma).all(), injected
 
 
 @pytest.mark.parametrize("n_modes", [5, 40])
@@ -98,24 +100,24 @@ def test_plants_at_random_are_found_or_refused(model, matrix_at, n_modes):
     for number in range(6):
         rng = np.random.default_rng(number)
         coarse_search = PITCH * rng.choice([0.3, 1.0, 3.0, 6.0])
-        planted = Registration.from_array(
+        injected = Registration.from_array(
             [*rng.uniform(-coarse_search, coarse_search, 2), *(rng.uniform(-1, 1, 3) * [12, 8, 8])]
         )
-        estimate = sprint(matrix_at(planted), model, modes=np.arange(n_modes), solver="registration-only")
-        error = np.abs(estimate.registration.to_array() - planted.to_array())
-        assert not estimate.converged or (error < 5 * estimate.sigma).all(), planted
+        estimate = sprint(matrix_at(injected), model, modes=np.arange(n_modes), solver="registration-only")
+        error = np.abs(estimate.registration.to_array() - injected.to_array())
+        assert not estimate.converged or (error < 5 * estimate.sigma).all(), injected
         found += estimate.converged
     assert found >= 4
 
 
 def test_high_modes_alone_are_found_by_many_starts(model, matrix_at):
-    planted = Registration(shift_x=400.0, shift_y=-250.0, rotation=4.0)
+    injected = Registration(shift_x=400.0, shift_y=-250.0, rotation=4.0)
     columns = np.arange(20, 25)
-    estimate = sprint(matrix_at(planted), model, modes=columns, solver="registration-only")
+    estimate = sprint(matrix_at(injected), model, modes=columns, solver="registration-only")
     assert estimate.converged
-    assert (np.abs(estimate.registration.to_array() - planted.to_array()) < 5 * estimate.sigma).all()
+    assert (np.abs(estimate.registration.to_array() - injected.to_array()) < 5 * estimate.sigma).all()
     assert not sprint(
-        matrix_at(planted), model, modes=columns, solver="registration-only", coarse_search=False
+        matrix_at(injected), model, modes=columns, solver="registration-only", coarse_search=False
     ).converged
 
 

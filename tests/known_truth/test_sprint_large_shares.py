@@ -58,14 +58,14 @@ def test_large_shares_are_found_with_the_registration(seed: int) -> None:
     sharp = make_fast_model(config, None)
     m2c = karhunen_loeve(*sharp.influence_functions(), 25, 4 * config.system.pupil_m)
     rng = np.random.default_rng(seed)
-    planted = Registration(*(rng.uniform(-1, 1, 5) * (40.0, 40.0, 1.5, 3.0, 3.0)))
-    there = sharp.zonal_matrix(planted)
-    exact = GAIN * (there + SHARE * (Dull(sharp).zonal_matrix(planted) - there)) @ m2c
+    injected = Registration(*(rng.uniform(-1, 1, 5) * (40.0, 40.0, 1.5, 3.0, 3.0)))
+    there = sharp.zonal_matrix(injected)
+    exact = GAIN * (there + SHARE * (Dull(sharp).zonal_matrix(injected) - there)) @ m2c
     sigma = np.full(exact.shape, 0.05 * exact.std(), np.float32)
     data = (exact + sigma * rng.standard_normal(exact.shape)).astype(np.float32)
     matrix = InteractionMatrix(data, sigma, m2c, nominal_grid(config).valid, "razor-shwfs", "docrime", True)
     estimate = run(fit_registration(matrix, Doubtful(sharp))).estimate
     assert estimate.converged, estimate.warnings
     assert len(estimate.iterations) <= 25
-    pulls = (estimate.registration.to_array() - planted.to_array()) / np.sqrt(np.diag(estimate.covariance))
+    pulls = (estimate.registration.to_array() - injected.to_array()) / np.sqrt(np.diag(estimate.covariance))
     assert np.abs(pulls).max() < 4.5

@@ -1,4 +1,4 @@
-"""The registration straight from telemetry, against planted truths and against the matrix route."""
+"""The registration straight from telemetry, against injected values and against the matrix route."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ SYSTEM = "razor-shwfs"
 
 
 def _calibrate(number: int, frames: int, estimator: str = "auto") -> tuple[np.ndarray, CalibrationResult]:
-    """Errors of the registration on a random plant, all imperfections on, and the calibration."""
-    plant = random_registration(number)
-    with open_system(SYSTEM, set=registration_overrides(plant), seed=number + 1) as bench:
+    """Errors of the registration on a random realisation, all imperfections on, and the calibration."""
+    realisation = random_registration(number)
+    with open_system(SYSTEM, set=registration_overrides(realisation), seed=number + 1) as bench:
         result = bench.calibrate(frames=frames, estimator=estimator)
     assert result.registration is not None
     assert result.registration.converged, result.registration.warnings
-    return result.registration.registration.to_array() - plant.to_array(), result
+    return result.registration.registration.to_array() - realisation.to_array(), result
 
 
 @pytest.fixture(scope="module")
@@ -128,7 +128,7 @@ def _attempt(bench: System):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("frames", [20, 50])
-def test_twenty_plants(frames):
+def test_twenty_realisations(frames):
     found = [_calibrate(number, frames) for number in range(20)]
     errors = np.array([e for e, _ in found])
     sigma = np.array([r.registration.sigma for _, r in found])

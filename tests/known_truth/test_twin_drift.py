@@ -113,12 +113,12 @@ def test_models_know_nothing_of_it(load):
     with System.from_config(load()) as system:
         grid = system.find_sensor(frames=5).grid
         still = system.model(grid).zonal_matrix(registration)
-        assert BenchRecord.from_bench(system).planted is not None
+        assert BenchRecord.from_bench(system).injected is not None
     with System.from_config(load(*words)) as system:
         system.wfs.next_frame(1.0)
         np.testing.assert_array_equal(system.model(grid).zonal_matrix(registration), still)
         # Nor does a report hold one number against a registration that moves.
-        assert BenchRecord.from_bench(system).planted is None
+        assert BenchRecord.from_bench(system).injected is None
 
 
 def test_what_the_configuration_refuses():

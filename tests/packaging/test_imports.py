@@ -44,4 +44,4 @@ def test_public_names_are_listed_and_load() -> None:
     for name in escape_hw.__all__:
         assert getattr(escape_hw, name) is not None
     with pytest.raises(AttributeError, match="no attribute 'opne_system'"):
-        escape_hw.opne_system
+        escape_hw.opne_system  # noqa: B018

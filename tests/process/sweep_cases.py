@@ -21,10 +21,10 @@ from escape_hw.runtime.session.system import System
 ESCAPE = (sys.executable, "-c", "from escape_hw.cli import main; main()")
 #: Short loops: a few tens of them run in some seconds.
 SHORT = (
-    "--trials", "12", "--candidates", "1", "--replicates", "1", "--final-replicates", "6", "--frames", "270", "--quiet",
-    "--json",
+    "--trials", "12", "--candidates", "1", "--replicates", "1", "--final-replicates", "6", "--frames", "270",
+    "--quiet", "--json",
 )  # fmt: skip
-#: 12 drawn, one heat and six finals of two matrices.
+#: 12 drawn, one replicate and six final ones of two matrices.
 LOOPS = 12 + 2 + 12
 
 

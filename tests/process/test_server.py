@@ -173,7 +173,7 @@ def test_sprint_on_a_stored_matrix(bench: Connection, matrix: str) -> None:
     run = bench.start("sprint", im=matrix)
     result = run.wait(120)
     assert result.registration.converged
-    shift = result.registration.measured()["shift_x"]
+    shift = result.registration.parameters()["shift_x"]
     assert abs(shift.value + 16) < 5 * shift.sigma < 10
     # The model's matrix is the one to close the loop with.
     made = {one.name: one.summary for one in bench.state.products}

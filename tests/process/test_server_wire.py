@@ -68,7 +68,10 @@ def test_garbage_is_refused_and_counted(raw: zmq.Socket[bytes], parts: list[byte
 
 @given(
     document=st.recursive(
-        st.none() | st.booleans() | st.floats() | st.text(max_size=10)
+        st.none()
+        | st.booleans()
+        | st.floats()
+        | st.text(max_size=10)
         | st.sampled_from(["start_procedure", "hello"]),
         lambda inner: (
             st.lists(inner, max_size=3)

@@ -1,4 +1,4 @@
-"""A campaign whose processes die."""
+"""A campaign with processes that die."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from escape_hw.paper.sky_time import RealisationErrors, simulated_config, sky_ti
 FRAMES = (300,)
 
 
-def plant(system: str, number: int, frames: Any, overrides: Any) -> RealisationErrors:
-    """A plant that is done at once, or, told so, takes its process with it."""
+def realisation(system: str, number: int, frames: Any, overrides: Any) -> RealisationErrors:
+    """A realisation that is finished at once or kills its process."""
     place, lasting = Path(overrides[0]), int(overrides[1])
     if number >= lasting:
         # The finished ones are on their way to the parent by then.
@@ -42,49 +42,53 @@ def fails(*_: Any) -> RealisationErrors:
 
 @pytest.fixture(autouse=True)
 def _stand_in(monkeypatch):
-    monkeypatch.setattr(campaign, "run_realisation", plant)
+    monkeypatch.setattr(campaign, "run_realisation", realisation)
 
 
-def test_a_killed_process_ends_the_campaign_and_finished_plants_are_kept(tmp_path):
-    curves = run(sky_time("razor-shwfs", plants=8, frames=FRAMES, overrides=[str(tmp_path), "3"]))
-    assert 1 <= curves["plants"] <= 3
-    assert f"died (killed, or out of memory) after {curves['plants']} of 8 plants" in curves["note"]
+def test_a_killed_process_ends_the_campaign_and_finished_realisations_are_kept(tmp_path):
+    curves = run(sky_time("razor-shwfs", realisations=8, frames=FRAMES, overrides=[str(tmp_path), "3"]))
+    assert 1 <= curves["realisations"] <= 3
+    assert (
+        f"died (killed, or out of memory) after {curves['realisations']} of 8 realisations" in curves["note"]
+    )
     assert curves["fewest_frames"]["whitened"] == 300
 
 
-def test_a_campaign_without_a_finished_plant_is_an_error(tmp_path):
-    with pytest.raises(CalibrationError, match="after 0 of 4 plants; try fewer processes than 2"):
-        run(sky_time("razor-shwfs", plants=4, frames=FRAMES, overrides=[str(tmp_path), "0"]))
+def test_a_campaign_without_a_finished_realisation_is_an_error(tmp_path):
+    with pytest.raises(CalibrationError, match="after 0 of 4 realisations; try fewer processes than 2"):
+        run(sky_time("razor-shwfs", realisations=4, frames=FRAMES, overrides=[str(tmp_path), "0"]))
 
 
 def test_a_campaign_without_accidents_has_no_note(tmp_path):
-    curves = run(sky_time("razor-shwfs", plants=5, frames=FRAMES, overrides=[str(tmp_path), "5"]))
-    assert curves["plants"] == 5
+    curves = run(sky_time("razor-shwfs", realisations=5, frames=FRAMES, overrides=[str(tmp_path), "5"]))
+    assert curves["realisations"] == 5
     assert "note" not in curves
 
 
-def test_stopped_it_keeps_the_finished_plants(tmp_path):
+def test_stopped_it_keeps_the_finished_realisations(tmp_path):
     stop = threading.Event()
 
     def watch(progress: Any) -> None:
         if progress.done >= 2:
             stop.set()
 
-    slow = sky_time("razor-shwfs", plants=60, frames=FRAMES, overrides=[str(tmp_path), "100"], workers=1)
+    slow = sky_time(
+        "razor-shwfs", realisations=60, frames=FRAMES, overrides=[str(tmp_path), "100"], workers=1
+    )
     with pytest.raises(Aborted) as caught:
         run(slow, observers=(watch,), abort=stop)
     curves = caught.value.partial
-    assert 2 <= curves["plants"] < 60
-    assert curves["note"] == f"stopped after {curves['plants']} of 60 plants"
+    assert 2 <= curves["realisations"] < 60
+    assert curves["note"] == f"stopped after {curves['realisations']} of 60 realisations"
 
 
-def test_an_error_in_a_plant_is_told(monkeypatch, tmp_path):
+def test_an_error_in_a_realisation_is_raised(monkeypatch, tmp_path):
     monkeypatch.setattr(campaign, "run_realisation", fails)
     with pytest.raises(CalibrationError, match="no spots"):
-        run(sky_time("razor-shwfs", plants=2, frames=FRAMES, overrides=[str(tmp_path), "1"]))
+        run(sky_time("razor-shwfs", realisations=2, frames=FRAMES, overrides=[str(tmp_path), "1"]))
 
 
-def test_only_twins_are_used_whatever_the_file_says():
+def test_every_device_is_simulated_whatever_the_file_says():
     config = load_system("razor-shwfs", mode="hardware", overrides=["devices.dm.mode=hardware"])
     twins = simulated_config(config, ["loop.gain=0.3"], seed=5)
     assert twins.system.mode == "sim"

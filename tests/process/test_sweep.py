@@ -1,4 +1,4 @@
-"""A sweep that is killed loses no finished trial, leaves none running, and ends as if nothing had been."""
+"""A killed sweep loses no finished trial, leaves none running, and is completed when it is resumed."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ def test_killed_workers_and_a_killed_sweep_lose_nothing(arguments, tmp_path):
     database = run / "study.db"
     first = start(*arguments, "--workers", "2", "--out", str(run))
     until(lambda: len(finished(database)) >= 2, process=first)
-    # A worker dies: its trials run again, and the sweep goes on by itself.
+    # A worker is killed: its trials run again, and the sweep continues.
     kill(workers_of(first.pid)[0])
     seen = len(finished(database))
     until(lambda: len(finished(database)) >= seen + 3, process=first)
-    # The sweep itself dies, and its workers end with it.
+    # The sweep is killed, and its workers end with it.
     orphans = workers_of(first.pid)
     kill(first.pid)
     first.communicate(timeout=30)
@@ -45,11 +45,13 @@ def test_killed_workers_and_a_killed_sweep_lose_nothing(arguments, tmp_path):
     assert len(loops(again)) == LOOPS
     assert set(document["best"]) == {"push-pull", "DO-CRIME"}
     assert (again / "report.html").stat().st_size > 10_000
-    # Resumed once more, it has nothing left to run, and shows what there is.
+    # Resumed again, nothing is left to run, and the result is shown.
     folders = sorted(path.name for path in tmp_path.iterdir())
     shown = ended(start("--resume", str(run), "--json", "--quiet"))
     assert (shown["folder"], shown["best"]) == (str(again), document["best"])
     assert sorted(path.name for path in tmp_path.iterdir()) == folders
-    # Whatever ran when and where, the loops are those of a sweep that nobody disturbed.
-    drawn = {(row["matrix"], row["air"]): row["gain"] for row in loops(again) if row["stage"] == "explore"}
-    assert all(drawn["push-pull", air] == gain for (_, air), gain in drawn.items())
+    # The parameters do not depend on when and where the loops ran.
+    drawn = {
+        (row["matrix"], row["realisation"]): row["gain"] for row in loops(again) if row["stage"] == "explore"
+    }
+    assert all(drawn["push-pull", index] == gain for (_, index), gain in drawn.items())

@@ -60,8 +60,8 @@ def test_two_runners_share_a_postgresql_that_is_killed(arguments, postgres, tmp_
         assert sum(document["sweep"]["loops"].values()) == LOOPS
     assert documents[0]["best"] == documents[1]["best"]
     # Both took part.
-    runners = postgres.ask("select distinct value_json from trial_user_attributes where key = 'runner'")
-    assert len(runners) == 2
+    hosts = postgres.ask("select distinct value_json from trial_user_attributes where key = 'host'")
+    assert len(hosts) == 2
 
 
 @pytest.mark.skipif(importlib.util.find_spec("distributed") is None, reason="pip install 'escape-hw[dask]'")

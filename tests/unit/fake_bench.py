@@ -102,7 +102,7 @@ class FakeProcedures:
         yield from steps("gain")
         return GainSearch(0.35, 0.02, [replace(fake.loop(matrix.method), gain=g) for g in (0.25, 0.35, 0.45)])
 
-    def simulated(self, bench: FakeBench, grid: Any, m2c: Any):
+    def nominal_calibration(self, bench: FakeBench, grid: Any, m2c: Any):
         self.calls.append(("simulated", {}))
         return fake.calibration("simulated")
 
@@ -129,7 +129,7 @@ def install(monkeypatch: pytest.MonkeyPatch) -> FakeProcedures:
         "loop.performance": ("close_loop",),
         "loop.gain_search": ("find_best_gain",),
         "acquisition.model_psf": ("measure_model_psf",),
-        "sprint.synthetic_matrix": ("simulated", "synthesise_from_measurement"),
+        "sprint.synthetic_matrix": ("nominal_calibration", "synthesise_from_measurement"),
     }
     # All of them are imported first: a module that is imported later would keep a replaced function.
     for module in places:

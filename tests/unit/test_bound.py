@@ -30,14 +30,14 @@ def case():
     n = N_COMMON + N_LINES + N_TRENDS + 2 * N_ACT + N_SLOPES
     return {
         "common": rng.standard_normal((N_COMMON, N_SLOPES, N_MODES)),
-        "slopes_gain": rng.standard_normal((N_SLOPES, N_ACT)),
-        "slopes_width": rng.standard_normal((N_SLOPES, N_ACT)),
+        "gain_derivative": rng.standard_normal((N_SLOPES, N_ACT)),
+        "width_derivative": rng.standard_normal((N_SLOPES, N_ACT)),
         "modes": rng.standard_normal((N_ACT, N_MODES)),
         "model": rng.standard_normal((N_SLOPES, N_MODES)),
         "residual": rng.standard_normal((N_SLOPES, N_MODES)),
         "precision": rng.uniform(0.5, 3, n),
         "offset": np.zeros(n),
-        "sampled": rng.standard_normal((N_SLOPES, N_MODES)),
+        "sampling_derivative": rng.standard_normal((N_SLOPES, N_MODES)),
         "lines": np.arange(N_SLOPES) % N_LINES,
         "trends": rng.standard_normal((N_SLOPES, N_TRENDS)),
     }
@@ -46,10 +46,12 @@ def case():
 def jacobian(c):
     """Derivatives of the matrix by every unknown ``(n_unknowns, n_slopes, n_modes)``."""
     rows = list(c["common"])
-    rows += [np.where((c["lines"] == k)[:, None], c["sampled"], 0.0) for k in range(N_LINES)]
+    rows += [np.where((c["lines"] == k)[:, None], c["sampling_derivative"], 0.0) for k in range(N_LINES)]
     rows += [trend[:, None] * c["model"] for trend in c["trends"].T]
     rows += [
-        np.outer(z[:, a], c["modes"][a]) for z in (c["slopes_gain"], c["slopes_width"]) for a in range(N_ACT)
+        np.outer(z[:, a], c["modes"][a])
+        for z in (c["gain_derivative"], c["width_derivative"])
+        for a in range(N_ACT)
     ]
     rows += [np.where((np.arange(N_SLOPES) == s)[:, None], c["model"], 0.0) for s in range(N_SLOPES)]
     return np.stack(rows)
@@ -80,7 +82,7 @@ def test_the_inverse_from_few_rows_is_that_of_the_truth(n_rows):
     spread = np.sqrt(np.diag(truth))
     sample = rng.multivariate_normal(np.zeros(p), truth, n_rows)
     # In units of the noise, as the mirror is handed on.
-    found = LowRankNoise.of(sample.T @ sample / n_rows, mirror / spread[:, None]).inverse()
+    found = LowRankNoise.from_covariance(sample.T @ sample / n_rows, mirror / spread[:, None]).inverse()
     trial = rng.standard_normal((p, 40))
     correlation = truth / np.outer(spread, spread)
     want = np.einsum("pk,pk->k", trial, np.linalg.solve(correlation, trial))
@@ -94,7 +96,7 @@ def test_the_inverse_from_few_rows_is_that_of_the_truth(n_rows):
 def test_patterns_beyond_what_noise_has_are_not_seen_as_less_than_it():
     rng, p = np.random.default_rng(6), 60
     sample = rng.standard_normal((2000, p))
-    noise = LowRankNoise.of(sample.T @ sample / 2000, rng.standard_normal((p, 5)))
+    noise = LowRankNoise.from_covariance(sample.T @ sample / 2000, rng.standard_normal((p, 5)))
     np.testing.assert_allclose(noise.inverse(), np.eye(p), atol=0.12)
     assert (noise.variances >= noise.level).all()
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import fake_results as fake
 import numpy as np
 import pytest
-from made_up_sweep import SWEPT, made_up
+from synthetic_sweep import SWEPT, synthetic_run
 
 import escape_hw
 from escape_hw.api.camera import CameraSettings, Frame, Region
@@ -55,7 +55,8 @@ RESULTS = {
     "GainsResult": (fake.gains_result, 1, ("of escape: 2 rounds", "converged")),
     "GainsRun": (lambda: GainsRun(fake.gains_result(), fake.calibration()), 2, ("rescaled",)),
     "SweepResult": (
-        lambda: analyse_sweep(SWEPT, made_up(0.05), 0.01), 6, ("128 loops", "ESCAPE better", "at its best"),
+        lambda: analyse_sweep(SWEPT, synthetic_run(0.05), 0.01), 6,
+        ("128 loops", "ESCAPE better", "at its best"),
     ),
     "SensorSetup": (lambda: SensorSetup(fake.grid(), np.zeros((400, 400), np.float32)), 1, ("400",)),
     "SubApertureGrid": (fake.grid, 1, ("pitch_px=15.55", "bool[24, 24]")),
@@ -63,7 +64,8 @@ RESULTS = {
     "RecordedFrames": (frames, 1, ("uint16[3, 400, 400]", "'S1'")),
     "Frame": (lambda: Frame(np.zeros((400, 400), np.uint16), 7, 1, 2), 1, ("index=7",)),
     "Comparison": (
-        lambda: CalibrationComparison({f"matrix {n}": fake.calibration() for n in range(3)}), 1, ("dict of 3",),
+        lambda: CalibrationComparison({f"matrix {n}": fake.calibration() for n in range(3)}), 1,
+        ("dict of 3",),
     ),
     "TemporalResponse": (lambda: fake.calibration().response, 1, ("float64[4]",)),
     "MirrorDepartures": (lambda: fake.registration().actuator_corrections, 1, ("float64[97]",)),

@@ -95,7 +95,7 @@ def test_push_pull_is_measured_without_turbulence(escape, bench, tmp_path):
 def test_human_output_names_registration_and_report(escape, bench, tmp_path):
     code, out, _ = escape("calibrate", "razor-shwfs", "--out", tmp_path / "run")
     assert code == 0
-    for word in ("SIMULATED", "Shift X [% of Sub Aperture]", "±", "planted", "report.html"):
+    for word in ("SIMULATED", "Shift X [% of Sub Aperture]", "±", "injected", "report.html"):
         assert word in out
 
 

@@ -74,7 +74,7 @@ def test_ctrl_c_while_closing_does_not_keep_the_mirror_from_its_flat(document, b
 @pytest.mark.parametrize("place", ["push-pull", "escape", "model_psf", "closed_loop"])
 def test_ctrl_c_in_a_reproduction_keeps_what_is_done(document, bench, tmp_path, place):
     bench.hook = lambda name: name == place and os.kill(os.getpid(), signal.SIGINT)
-    code, found, _ = document("reproduce", "shwfs", "--out", tmp_path / "run", "--plants", 0)
+    code, found, _ = document("reproduce", "shwfs", "--out", tmp_path / "run", "--realisations", 0)
     assert code == 130
     assert found["partial"] is True
     assert found["criteria"] == []

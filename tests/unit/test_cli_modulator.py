@@ -29,7 +29,7 @@ def test_the_twin_answers(document, verb):
     assert found["simulated"]
     assert found["info"]["model"] == "simulated PI S-330 with E-727"
     assert found["changed"] == (verb != "status")
-    assert "this moves" not in err
+    assert "this changes hardware" not in err
     if verb == "start":
         assert found["modulation"]["radius_lambda_d"] == pytest.approx(3.0)
         assert found["left"] == "parked", "a twin ends with the command"
@@ -39,8 +39,10 @@ def test_start_status_stop_on_the_wire(document, escape, stage):
     emulator, here = stage
     code, found, err = document("modulator", "start", "razor-pywfs", "--radius", 2, "--frequency", 300, *here)
     assert code == 0, err
-    assert "this moves the modulator: servos on, auto-zero where needed, centre, then the circle" in err
-    assert "asked for 2 lambda/D (94 urad) at 300 Hz; it does 2 lambda/D (94 urad) at 298.507 Hz" in err
+    assert "this changes hardware, devices.modulator" in err
+    assert ": servos on, auto-zero where needed, centre, then the circle" in err
+    assert "requested: 2 lambda/D (94 urad) at 300 Hz" in err
+    assert "achievable: 2 lambda/D (94 urad) at 298.507 Hz" in err
     assert found["asked"] == {"radius_lambda_d": 2.0, "frequency_hz": 300.0}
     assert found["foreseen"]["frequency_hz"] == pytest.approx(1 / (67 * 50e-6))
     assert found["modulation"]["radius_lambda_d"] == pytest.approx(2.0)
@@ -50,15 +52,16 @@ def test_start_status_stop_on_the_wire(document, escape, stage):
 
     code, found, err = document("modulator", "status", "razor-pywfs", *here)
     assert code == 0
-    assert "this moves" not in err
+    assert "this changes hardware" not in err
     assert found["modulation"]["radius_lambda_d"] == pytest.approx(2.0, rel=0.01)
     assert emulator.controller.state.describe() == "turning"
     code, out, _ = escape("modulator", "status", "razor-pywfs", *here)
-    assert "turning: 2 lambda/D" in out or "turning: 1.99" in out or "turning: 2.00" in out
+    assert "modulating: 2 lambda/D" in out or "modulating: 1.99" in out or "modulating: 2.00" in out
 
     code, found, err = document("modulator", "stop", "razor-pywfs", *here)
     assert code == 0
-    assert "this moves the modulator: centre, servos off" in err
+    assert "this changes hardware, devices.modulator" in err
+    assert ": centre, servos off" in err
     assert (found["modulation"], found["left"]) == (None, "parked")
     assert emulator.controller.state.describe() == "at rest"
     assert emulator.violations == ()

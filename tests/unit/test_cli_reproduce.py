@@ -13,9 +13,9 @@ from escape_hw.paper.cases import CASES
 @pytest.mark.usefixtures("reports")
 def test_reproduce_shwfs_shows_registration_strehl_and_report(escape, bench, tmp_path):
     run = tmp_path / "run"
-    code, out, err = escape("reproduce", "shwfs", "--out", run, "--loop-frames", 321, "--plants", 0)
+    code, out, err = escape("reproduce", "shwfs", "--out", run, "--loop-frames", 321, "--realisations", 0)
     assert code == 0, err
-    for word in ("planted", "Shift Y", "push-pull", "DO-CRIME", "ESCAPE", "OTF", "±"):
+    for word in ("injected", "Shift Y", "push-pull", "DO-CRIME", "ESCAPE", "OTF", "±"):
         assert word in out
     assert out.strip().splitlines()[-1] == f"report: {run / 'report.html'}"
     assert bench.benches[0].screen_seen == {
@@ -35,12 +35,12 @@ def test_reproduce_shwfs_shows_registration_strehl_and_report(escape, bench, tmp
 
 
 def test_reproduce_judges_its_own_result(document, bench, tmp_path):
-    words = ("reproduce", "shwfs", "--out", tmp_path / "run", "--plants", 0)
+    words = ("reproduce", "shwfs", "--out", tmp_path / "run", "--realisations", 0)
     code, found, _ = document(*words, "--set", "twin.registration.shift_x=30")
     assert code == 1
     failed = [check["text"] for check in found["criteria"] if not check["met"]]
     assert len(failed) == 1
-    assert "planted registration" in failed[0]
+    assert "injected registration" in failed[0]
 
 
 def test_reproduce_table1(escape, document, bench, tmp_path):
@@ -62,7 +62,7 @@ def test_reproduce_table1(escape, document, bench, tmp_path):
 def test_reproduce_maps_shows_the_matrix_beside_its_simulation(escape, bench, tmp_path):
     run = tmp_path / "run"
     code, out, err = escape("reproduce", "maps", "--out", run, "--frames", 4000, "--loop-frames", 321)
-    # The stand-in's registration is not the one planted in this system.
+    # The stand-in's registration is not the one injected in this system.
     assert code == 1, err
     assert bench.benches[0].config.system.name == "maps-nir"
     names = [name for name, _ in bench.calls]
@@ -70,7 +70,7 @@ def test_reproduce_maps_shows_the_matrix_beside_its_simulation(escape, bench, tm
     assert "DO-CRIME" in out
     assert "ESCAPE minus DO-CRIME" in out
     page = (run / "report.html").read_text()
-    for word in ("simulation", "dirty mirror", "Stacked closed-loop PSFs"):
+    for word in ("simulation", "contaminated mirror", "Stacked closed-loop PSFs"):
         assert word in page
     assert load_loop(run / "loop_docrime.fits").header["PARENT1"] == "docrime.fits"
 

@@ -15,7 +15,7 @@ from escape_hw.config.loader import load_system
 from escape_hw.io.documents import track_document
 from escape_hw.runtime.procedures.track import INJECTED_UNKNOWN, injected_registration
 
-PLANTED = {
+INJECTED = {
     "shift_x": -16.0,
     "shift_y": -71.0,
     "rotation": -0.77,
@@ -24,31 +24,31 @@ PLANTED = {
 }
 
 
-def shown(result: TrackResult, planted: dict[str, float] | None, note: str = "") -> str:
+def shown(result: TrackResult, injected: dict[str, float] | None, note: str = "") -> str:
     console = Console(file=io.StringIO(), width=120)
-    document = {**track_document(result), "planted_end": planted, "planted_note": note, "products": {}}
+    document = {**track_document(result), "injected_end": injected, "injected_note": note, "products": {}}
     one = SimpleNamespace(show=lambda *what: [console.print(item) for item in what])
-    show_track(one, result, planted is not None, document)  # type: ignore[arg-type]
+    show_track(one, result, injected is not None, document)  # type: ignore[arg-type]
     return console.file.getvalue()  # type: ignore[attr-defined, no-any-return]
 
 
 def track() -> TrackResult:
     result = TrackResult()
     for second in (1.0, 2.0):
-        values = {name: PLANTED[name] + 0.2 for name in PARAMETERS}
+        values = {name: INJECTED[name] + 0.2 for name in PARAMETERS}
         result.add(
             seconds=second, residual_nm=50.0, **values, **{f"{name}_sigma": 0.1 for name in PARAMETERS}
         )
     return result
 
 
-@pytest.mark.parametrize("planted", [PLANTED, None])
-def test_the_registration_stands_beside_the_planted_one(planted: dict[str, float] | None) -> None:
-    text = shown(track(), planted)
+@pytest.mark.parametrize("injected", [INJECTED, None])
+def test_the_registration_stands_beside_the_injected_one(injected: dict[str, float] | None) -> None:
+    text = shown(track(), injected)
     (row,) = [line.split() for line in text.splitlines() if "Shift X" in line]
     assert row[row.index("±") - 1 : row.index("±") + 2] == ["−15.80", "±", "0.10"]
-    assert ("planted" in text) == (planted is not None)
-    if planted is not None:
+    assert ("injected" in text) == (injected is not None)
+    if injected is not None:
         assert row[-2:] == ["+2.0", "−16"]
 
 
@@ -58,7 +58,7 @@ def test_a_truth_that_cannot_be_known_is_left_out_and_told() -> None:
     behind = load_system("razor-shwfs", overrides=("twin.drift.rate.shift_x=2.0",), mode="hardware")
     assert injected_registration(behind) is None
     text = shown(track(), None, INJECTED_UNKNOWN)
-    assert "planted" not in text
+    assert "injected" not in text
     assert "a clock of its own" in text
 
 

@@ -147,8 +147,7 @@ WRONG = {
         "region = [120, 56, 400, 400]",
         "region = [400, 400]",
         "region = [400, 400]",
-        "devices.wfs.region: [400, 400]  has too few items; "
-        "expected: region: x, y, width, height, pixels",
+        "devices.wfs.region: [400, 400]  has too few items; expected: region: x, y, width, height, pixels",
     ),
     "number for array": (
         "frequency_hz = [17.0, 43.0]",

@@ -100,7 +100,8 @@ WRONG = {
         "[130.0, 128.0]",
         "[130.0, 170.0]",
         "pupils_px",
-        "sensor.pupils_px: [130.0, 170.0]  the region of 192 x 192 pixels cuts off part of this image of 64 pixels",
+        "sensor.pupils_px: [130.0, 170.0]  the region of 192 x 192 pixels cuts off part of this image "
+        "of 64 pixels",
     ),
     "more than the modulator reaches": (
         "max_tilt_rad = 1.0e-3",

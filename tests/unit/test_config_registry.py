@@ -122,7 +122,9 @@ def test_what_makes_no_mirror_is_named_with_what_is_expected(name: str, message:
 def test_a_broken_model_is_named_with_what_is_expected() -> None:
     with pytest.raises(ConfigError, match=r"takes \(config\).*called as factory\(config, grid\)"):
         registry.model_factory("plug-model")
-    with pytest.raises(ConfigError, match="'plug-none' creates a SystemConfig, not a SyntheticModel; plug_mi"):
+    with pytest.raises(
+        ConfigError, match="'plug-none' creates a SystemConfig, not a SyntheticModel; plug_mi"
+    ):
         registry.model_factory("plug-none")(load_system("razor-shwfs"), None)
 
 
@@ -168,7 +170,7 @@ def test_a_script_may_register_a_driver_of_its_own(monkeypatch: pytest.MonkeyPat
     with pytest.raises(ConfigError, match="no device driver 'bench-mirror' is installed"):
         registry.device_factory("bench-mirror")
     for number in (1, 2):
-        factory = lambda name, config, shared, number=number: number
+        factory = lambda name, config, shared, number=number: number  # noqa: E731
         registry.register_device("bench-mirror", factory)
         assert registry.device_factory("bench-mirror") is factory
     assert "bench-mirror" in registry.available(registry.DEVICES)

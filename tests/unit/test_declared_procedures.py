@@ -1,4 +1,7 @@
-"""Procedures are declared once: every interface has the declared parameters, and a new one needs a module and a line."""
+"""Procedures are declared once.
+
+Every interface has the declared parameters, and a new one needs a module and a line.
+"""
 
 from __future__ import annotations
 

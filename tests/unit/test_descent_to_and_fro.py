@@ -36,7 +36,7 @@ class System:
 
 
 class Weighted:
-    def noise(self, residual):
+    def noise_level(self, residual):
         return 1.0
 
 
@@ -48,7 +48,7 @@ class Overshooting:
     def __init__(self, too_far, at_least=0.0):
         self.too_far, self.at_least, self.steps = too_far, at_least, 0
 
-    def start(self, registration):
+    def initial_state(self, registration):
         return Place(registration.to_array())
 
     def linearise(self, state):

@@ -35,7 +35,7 @@ def idle_state() -> EngineState:
 
 def loop_control() -> Any:
     control = SimpleNamespace(opened=False)
-    control.open = lambda: setattr(control, "opened", True)
+    control.request_open = lambda: setattr(control, "opened", True)
     return control
 
 

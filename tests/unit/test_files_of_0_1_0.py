@@ -13,6 +13,7 @@ import pytest
 from escape_hw.io.fits.gains import load_gains
 from escape_hw.io.fits.loop import load_loop
 from escape_hw.io.fits.matrix import load_matrix
+from escape_hw.io.run_folder import read_result
 from escape_hw.streams.recording.block_file import read_recording
 
 OLD = Path(__file__).parents[1] / "data" / "0.1.0"
@@ -34,7 +35,7 @@ def reported(run: str) -> dict[str, Any]:
 def test_a_matrix_has_the_registration_that_its_run_reported():
     result, run = load_matrix(OLD / "escape" / "im.fits").result, reported("escape")
     assert result.registration is not None
-    for name, estimate in result.registration.measured().items():
+    for name, estimate in result.registration.parameters().items():
         expected = run["registration"][name]
         assert (estimate.value, estimate.sigma) == pytest.approx((expected["value"], expected["sigma"]))
     assert result.registration.converged
@@ -108,3 +109,10 @@ def test_a_tracked_run_keeps_its_course(document):
     code, found, _ = document("show", OLD / "track")
     assert code == 0
     assert found["track"]["seconds"] == reported("track")["track"]["seconds"]
+
+
+def test_a_result_is_read_with_the_present_names_of_its_keys():
+    found, stored = read_result(OLD / "escape"), reported("escape")
+    assert found["injected"] == stored["planted"]
+    assert "planted" not in found
+    assert read_result(OLD / "track")["injected_end"] == reported("track")["planted_end"]

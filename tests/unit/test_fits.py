@@ -67,7 +67,7 @@ def test_matrix_comes_back_as_it_was(tmp_path):
         stored, wanted = (getattr(grid, part.name) for grid in (product.grid, result.grid))
         assert np.any(wanted), part.name
         np.testing.assert_array_equal(stored, wanted, err_msg=part.name)
-    assert product.registration.measured() == result.registration.measured()
+    assert product.registration.parameters() == result.registration.parameters()
     steps = [[dataclasses.asdict(step) for step in r.registration.iterations] for r in (product, result)]
     assert steps[0] == steps[1]
     assert product.registration.warnings == result.registration.warnings

@@ -35,14 +35,14 @@ def test_a_product_gives_back_everything(tmp_path):
     for one, other in zip(found.rounds, made.rounds, strict=True):
         same(one.gains, other.gains)
         assert repr(replace(one, gains=other.gains)) == repr(other)
-    same(found.beside["DO-CRIME"], made.beside["DO-CRIME"])
+    same(found.comparisons["DO-CRIME"], made.comparisons["DO-CRIME"])
     assert repr(found.closure) == repr(made.closure)
     for name in ("method", "converged", "loop_gain", "frames", "lost_frames", "partial", "notes"):
         assert getattr(found, name) == getattr(made, name), name
 
 
 def test_an_aborted_bootstrap_without_a_round_is_kept_under_a_name_that_says_so(tmp_path):
-    made = replace(fake.gains_result(), rounds=(), beside={}, converged=False, partial=True)
+    made = replace(fake.gains_result(), rounds=(), comparisons={}, converged=False, partial=True)
     path = save_gains(tmp_path / "gains.fits", made, "razor-pywfs", True)
     assert path.name == "gains.partial.fits"
     found = load_gains(path).result
@@ -80,7 +80,7 @@ def test_gains_on_both_sides_of_one_get_an_axis_each():
     assert len(both.axes) == 2
     labels = [text.get_text() for text in both.axes[0].get_legend().get_texts()]
     assert labels == ["ESCAPE (left)", "DO-CRIME (right)"]
-    alone = figures_gains.optical_gains(replace(fake.gains_result(), beside={}))
+    alone = figures_gains.optical_gains(replace(fake.gains_result(), comparisons={}))
     assert len(alone.axes) == 1
     # The mode without a measurement has no point.
     assert len(alone.axes[0].containers[0].lines[0].get_xdata()) == N - 1

@@ -127,7 +127,7 @@ def test_doctor_names_what_is_wrong_and_the_way_out(bench: Path) -> None:
     ):
         assert found[item].level == "warning", item
         assert text in found[item].text
-        assert way in found[item].way_out
+        assert way in found[item].remedy
     assert found["ALPAO SDK"].level in ("info", "ok")
     assert doctor.exit_code(list(found.values())) == 1
 
@@ -136,7 +136,7 @@ def test_doctor_tells_the_way_out_of_a_computer_without_usb(tmp_path: Path) -> N
     config = load_system("razor-shwfs", overrides=["devices.wfs.mode=hardware"])
     found = levels(tmp_path, config)
     assert found["usbfs memory"].level == "error"
-    assert "virtual machine" in found["usbfs memory"].way_out
+    assert "virtual machine" in found["usbfs memory"].remedy
 
 
 def test_doctor_is_content_with_a_good_bench(bench: Path) -> None:
@@ -155,7 +155,7 @@ def test_what_a_real_system_needs_and_lacks_is_an_error(bench: Path, monkeypatch
     config = load_system("razor-shwfs", overrides=["devices.dm.mode=hardware"])
     found = levels(bench, config)
     assert found["ALPAO SDK"].level == "error"
-    assert "ESCAPE_ALPAO_LIBRARY" in found["ALPAO SDK"].way_out
+    assert "ESCAPE_ALPAO_LIBRARY" in found["ALPAO SDK"].remedy
     assert "XIMEA API" not in found, "its camera is a twin"
     assert doctor.exit_code(list(found.values())) == 2
 

@@ -16,8 +16,8 @@ def case(request):
     n = N_COMMON + n_trends + 2 * N_ACT + N_SLOPES
     return {
         "common": rng.standard_normal((N_COMMON, N_SLOPES, N_MODES)),
-        "slopes_gain": rng.standard_normal((N_SLOPES, N_ACT)),
-        "slopes_width": rng.standard_normal((N_SLOPES, N_ACT)),
+        "gain_derivative": rng.standard_normal((N_SLOPES, N_ACT)),
+        "width_derivative": rng.standard_normal((N_SLOPES, N_ACT)),
         "modes": rng.standard_normal((N_ACT, N_MODES)),
         "model": rng.standard_normal((N_SLOPES, N_MODES)),
         "residual": rng.standard_normal((N_SLOPES, N_MODES)),
@@ -31,7 +31,7 @@ def jacobian(c):
     """Derivatives of the matrix by every unknown ``(n_slopes * n_modes, n_unknowns)``."""
     columns = list(c["common"])
     columns += [trend[:, None] * c["model"] for trend in c["trends"].T]
-    for zonal in (c["slopes_gain"], c["slopes_width"]):
+    for zonal in (c["gain_derivative"], c["width_derivative"]):
         columns += [np.outer(zonal[:, a], c["modes"][a]) for a in range(N_ACT)]
     for s in range(N_SLOPES):
         one = np.zeros((N_SLOPES, N_MODES))
@@ -86,7 +86,7 @@ def test_without_priors_they_are_orthogonal_to_every_random_effect(case):
     vague["common"] = rng.standard_normal((N_COMMON, N_SLOPES, 40))
     left = normal_equations(**vague).projected_jacobian()
     for a in range(N_ACT):
-        for zonal in (vague["slopes_gain"], vague["slopes_width"]):
+        for zonal in (vague["gain_derivative"], vague["width_derivative"]):
             effect = np.outer(zonal[:, a], vague["modes"][a])
             assert np.einsum("psm,sm->p", left, effect) == pytest.approx(np.zeros(N_COMMON), abs=1e-6)
     for trend in vague["trends"].T:

@@ -10,7 +10,7 @@ import pytest
 from escape_hw.calibration.sprint.diagnostics import describe_degeneracies
 from escape_hw.calibration.sprint.least_squares import MAX_STEP
 from escape_hw.calibration.sprint.mode_choice import choose_by_fisher_information
-from escape_hw.calibration.sprint.slope_weights import huber_weights
+from escape_hw.calibration.sprint.weighted_matrix import huber_weights
 
 NAMES = ("gain", "shift_x", "shift_y", "rotation", "radial_scaling", "tangential_scaling")
 UNIT = np.append(1.0, MAX_STEP)
@@ -50,7 +50,7 @@ def test_a_degeneracy_is_named_with_its_reason():
     correlation = np.eye(6)
     correlation[0, 4] = correlation[4, 0] = 0.999
     (note,) = describe_degeneracies(correlation * np.outer(sigma, sigma), NAMES)
-    assert note.startswith("gain and radial scaling can hardly be told apart (a larger mirror")
+    assert note.startswith("gain and radial scaling are hardly separable (a larger mirror")
     # 1 / sqrt(1 - 0.999^2) = 22.
     assert "22 times better" in note
 
@@ -67,7 +67,7 @@ def test_three_that_go_together_are_named_together():
     direction /= np.linalg.norm(direction)
     covariance = np.eye(6) - (1 - 1e-4) * np.outer(direction, direction)
     (note,) = describe_degeneracies(covariance, NAMES)
-    assert note.startswith("gain, radial scaling and tangential scaling can hardly be told apart")
+    assert note.startswith("gain, radial scaling and tangential scaling are hardly separable")
 
 
 def test_only_sub_apertures_that_stand_out_are_trusted_less():

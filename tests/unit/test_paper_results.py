@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 
 import pytest
-from made_up_sweep import SWEPT, made_up
+from synthetic_sweep import SWEPT, synthetic_run
 
 from escape_hw.errors import ConfigError
 from escape_hw.io.run_folder import RunFolder
@@ -20,7 +20,7 @@ from escape_hw.runtime.sweep.result import analyse_sweep
 def sweep_run(tmp_path_factory):
     with RunFolder("razor-shwfs", "sweep", tmp_path_factory.mktemp("sweep") / "run") as folder:
         head = {"schema": 1, "command": "sweep", "system": "razor-shwfs", "simulated": True, "seed": 1}
-        folder.write_result({**head, **sweep_document(analyse_sweep(SWEPT, made_up(0.0), 0.01))})
+        folder.write_result({**head, **sweep_document(analyse_sweep(SWEPT, synthetic_run(0.0), 0.01))})
     return folder.path
 
 
@@ -61,5 +61,5 @@ def test_what_is_no_sweep_of_the_papers_is_refused(tmp_path):
 def test_a_sweep_that_was_broken_off_is_not_taken_for_a_finished_one(sweep_run, tmp_path):
     document = json.loads((sweep_run / "result.json").read_text())
     (tmp_path / "result.json").write_text(json.dumps({**document, "partial": True}))
-    with pytest.raises(ConfigError, match="broken off; finish it"):
+    with pytest.raises(ConfigError, match="unfinished; finish it"):
         find_sweeps([tmp_path])

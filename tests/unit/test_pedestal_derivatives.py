@@ -11,7 +11,7 @@ import small_system
 from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.registration import PARAMETERS, Registration
 from escape_hw.api.results import PEDESTAL, ActuatorCorrections, Estimate, RegistrationEstimate
-from escape_hw.calibration.sprint.mixed_effects import SHAPE, WIDTH, Problem, State
+from escape_hw.calibration.sprint.mixed_effects import SHAPE, WIDTH, MixedEffectsProblem, MixedEffectsState
 from escape_hw.calibration.sprint.normal_equations import Priors
 from escape_hw.calibration.sprint.synthetic_matrix import compute_fitted_jacobian, compute_fitted_matrix
 from escape_hw.calibration.sprint.weighted_matrix import WeightedMatrix
@@ -29,16 +29,16 @@ def model() -> ShackHartmannModel:
 
 
 @pytest.fixture(scope="module")
-def problem(model: ShackHartmannModel) -> Problem:
+def problem(model: ShackHartmannModel) -> MixedEffectsProblem:
     """A mirror without pedestal, seen by a fit that starts elsewhere."""
     data = model.zonal_matrix(Registration(3.0, -5.0, 0.4, 0.2, 0.1)).astype(np.float32)
     valid = nominal_grid(small_system.configuration()).valid
     sigma, single = np.full(data.shape, 0.1, np.float32), np.eye(model.n_act)
     matrix = InteractionMatrix(data, sigma, single, valid, "small", "push-pull", True)
-    return Problem(WeightedMatrix.of(matrix, np.arange(model.n_act)), model, Priors())
+    return MixedEffectsProblem(WeightedMatrix.from_columns(matrix, np.arange(model.n_act)), model, Priors())
 
 
-def beside(state: State, name: str, sign: int) -> tuple[State, float]:
+def beside(state: MixedEffectsState, name: str, sign: int) -> tuple[MixedEffectsState, float]:
     """A state half a step away, and how far that is."""
     if name in PARAMETERS:
         step = sign * STEPS[PARAMETERS.index(name)] * (np.array(PARAMETERS) == name)
@@ -47,8 +47,8 @@ def beside(state: State, name: str, sign: int) -> tuple[State, float]:
 
 
 @pytest.mark.parametrize("pedestal", [0.5, 0.2, -0.4, 0.0])
-def test_a_fit_is_linearised_with_its_pedestal(problem: Problem, pedestal: float) -> None:
-    state = replace(problem.start(PLACE), width=0.12, shape=pedestal)
+def test_a_fit_is_linearised_with_its_pedestal(problem: MixedEffectsProblem, pedestal: float) -> None:
+    state = replace(problem.initial_state(PLACE), width=0.12, shape=pedestal)
     system = problem.linearise(state)
     for place, name in zip((*range(1, 6), WIDTH, SHAPE), (*PARAMETERS, "width", "shape"), strict=True):
         (more, up), (less, down) = (beside(state, name, sign) for sign in (1, -1))
@@ -58,10 +58,10 @@ def test_a_fit_is_linearised_with_its_pedestal(problem: Problem, pedestal: float
 
 @pytest.mark.parametrize("pedestal", [0.5, -0.4])
 def test_unequal_widths_spread_the_pedestal_too(
-    problem: Problem, model: ShackHartmannModel, pedestal: float
+    problem: MixedEffectsProblem, model: ShackHartmannModel, pedestal: float
 ) -> None:
     """A thousandth of width, so that second orders do not matter."""
-    state = replace(problem.start(PLACE), gain=1.0, width=0.12, shape=pedestal)
+    state = replace(problem.initial_state(PLACE), gain=1.0, width=0.12, shape=pedestal)
     unequal = 1e-3 * np.random.default_rng(0).standard_normal(model.n_act)
 
     def whole(width: float) -> np.ndarray:
@@ -70,7 +70,7 @@ def test_unequal_widths_spread_the_pedestal_too(
 
     even = whole(1.12)
     want = np.stack([whole(1.12 * (1 + w))[:, a] for a, w in enumerate(unequal)], axis=1) - even
-    fitted = problem.zonal(replace(state, actuator_width=unequal)) - problem.zonal(state)
+    fitted = problem.zonal_matrix(replace(state, actuator_width=unequal)) - problem.zonal_matrix(state)
     assert np.linalg.norm(fitted - want) < 0.01 * np.linalg.norm(want)
     nothing = np.zeros(model.n_act)
     single, estimate = np.eye(model.n_act), told(ActuatorCorrections(nothing, nothing, unequal, pedestal))

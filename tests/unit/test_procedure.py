@@ -331,7 +331,7 @@ def test_reporter_is_due_at_once_and_then_at_most_twenty_times_a_second(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     now = 100.0
-    clock: Any = lambda: now
+    clock: Any = lambda: now  # noqa: E731
     monkeypatch.setattr("escape_hw.api.procedure.time.monotonic", clock)
     report = Reporter("frames", 1000)
     yielded = []

@@ -45,6 +45,24 @@ def test_type_checkers_and_the_interpreter_see_the_same_names() -> None:
     assert set(seen) == set(escape_hw.__all__) - {"__version__"}
 
 
+PUBLIC_FUNCTIONS = sorted(name for name in escape_hw.__all__ if inspect.isfunction(getattr(escape_hw, name)))
+
+
+@pytest.mark.parametrize("name", PUBLIC_FUNCTIONS)
+def test_public_functions_have_an_explicit_typed_signature(name: str) -> None:
+    signature = inspect.signature(getattr(escape_hw, name))
+    for parameter in signature.parameters.values():
+        assert parameter.kind not in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD), parameter
+        assert parameter.annotation is not parameter.empty, parameter
+    assert signature.return_annotation is not signature.empty
+
+
+def test_sprint_documents_what_it_returns() -> None:
+    assert inspect.signature(escape_hw.sprint).return_annotation == "RegistrationEstimate"
+    documented = inspect.getdoc(escape_hw.sprint).partition("Returns\n-------\n")[2]
+    assert documented.startswith("RegistrationEstimate\n")
+
+
 def test_errors_and_configuration_do_not_load_the_numerics() -> None:
     code = (
         "import escape_hw, sys, json\n"

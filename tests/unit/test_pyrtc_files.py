@@ -135,7 +135,8 @@ def test_other_modes_of_the_same_span() -> None:
     turn = np.random.default_rng(0).standard_normal((94, 5))
     other = convert_basis(matrix, matrix.m2c @ turn)
     np.testing.assert_allclose(other.data, matrix.data @ turn, rtol=1e-3, atol=1e-3)
-    with pytest.raises(IncompatibleProduct, match=r"not a linear combination of the matrix's 94 modes.*basis.n_modes=97"):
+    reason = r"not a linear combination of the matrix's 94 modes.*basis.n_modes=97"
+    with pytest.raises(IncompatibleProduct, match=reason):
         convert_basis(matrix, np.eye(97))
 
 

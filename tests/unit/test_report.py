@@ -50,7 +50,7 @@ def make_run(folder, *, simulated=True, partial=False, lean=False, title="A <tit
             {
                 **documents.header_fields("test", "razor-shwfs", simulated, 1),
                 "title": title,
-                "planted": fake.PLANTED.to_dict(),
+                "injected": fake.INJECTED.to_dict(),
                 "labels": {"escape": {"label": "ESCAPE", "measured": "DO-CRIME", "column": "SHORT"}},
                 "bench": {
                     "psf_px": 2.46,
@@ -114,7 +114,7 @@ def test_page_shows_everything(page):
     for word in (
         "SIMULATED", "SPRINT convergence", "Stacked closed-loop PSFs", "Interaction matrices", "Sky time",
         "Residual wavefront", "last mirror command", "Mean sensor frame", "best gain", "a missed one",
-        "α SHORT", "planted", "Signal-to-noise", "Temporal response", "Configuration",
+        "α SHORT", "injected", "Signal-to-noise", "Temporal response", "Configuration",
         "&lt;script&gt;alert(1)",
     ):  # fmt: skip
         assert word in page, word
@@ -180,7 +180,7 @@ def test_empty_mode_and_missing_errors_draw():
 
 def test_convergence_draws_parameters_truth_and_errors():
     estimate = fake.registration()
-    figure = figures_registration.convergence(estimate, fake.PLANTED)
+    figure = figures_registration.convergence(estimate, fake.INJECTED)
     assert len(figure.axes) == 6
     assert figure.axes[0].get_yscale() == "log"
     for panel, name in zip(figure.axes[1:], PARAMETERS, strict=True):
@@ -188,7 +188,7 @@ def test_convergence_draws_parameters_truth_and_errors():
         np.testing.assert_allclose(
             track.get_ydata(), [getattr(step.registration, name) for step in estimate.iterations]
         )
-        assert truth.get_ydata()[0] == getattr(fake.PLANTED, name)
+        assert truth.get_ydata()[0] == getattr(fake.INJECTED, name)
         assert "[" in panel.get_ylabel()
 
 
@@ -243,9 +243,9 @@ def test_numbers_are_rounded_to_their_error(value, sigma, text):
 
 def test_registration_table_has_the_papers_form():
     short, long = fake.registration(seed=3), fake.registration(0.3, seed=4)
-    table = tables.registration_table({"SHORT": short, "LONG": long}, fake.PLANTED)
+    table = tables.registration_table({"SHORT": short, "LONG": long}, fake.INJECTED)
     assert table.headings[0::2] == ("Component", "Δ / σ", "Δ / σ")
-    assert (table.headings[1], table.headings[3], table.headings[-1]) == ("α SHORT", "α LONG", "planted")
+    assert (table.headings[1], table.headings[3], table.headings[-1]) == ("α SHORT", "α LONG", "injected")
     assert [row[0] for row in table.rows] == [
         "Shift X [% of Sub Aperture]",
         "Shift Y [% of Sub Aperture]",
@@ -336,5 +336,5 @@ def test_picture_of_a_run(tmp_path):
 
 
 def test_sky_time_is_told_in_words_too(page):
-    assert "rms over 20 random plants" in page
+    assert "rms over 20 random registrations" in page
     assert "Fewest frames that meet every goal: whitened 500, plain none of these." in page

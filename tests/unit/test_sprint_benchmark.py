@@ -43,7 +43,7 @@ def test_on_the_pyramid_both_solve_oopaos_matrix_and_ours_is_nearer():
     config = load_system("razor-pywfs", overrides=sprint._OOPAO_PYRAMID)
     model = make_fast_model(config, None)
     low = karhunen_loeve(*model.influence_functions(), 5, 4 * config.system.pupil_m)
-    peer, at = OopaoPeer(config, low), sprint.planted(config)
+    peer, at = OopaoPeer(config, low), sprint.injected(config)
     theirs = peer.matrix(at, sprint.mirror(False))
     ours = model.modal_matrix(at, low)
     scale = np.vdot(ours, theirs) / np.vdot(ours, ours)

@@ -1,11 +1,11 @@
-"""Straight lines through estimates that fade: no lag, honest errors, surprises."""
+"""Straight lines through estimates that fade: no lag, honest errors, innovations."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from escape_hw.calibration.tracking.smoothing import DoubleExponentialSmoother
+from escape_hw.calibration.tracking.live_registration import DoubleExponentialSmoother
 
 KEEP = float(np.exp(-1 / 8))
 SIGMA = 0.3
@@ -58,9 +58,9 @@ def test_a_jump_is_a_surprise_and_noise_is_none():
     truth = np.zeros(50)
     truth[40:] = 10.0
     found = follow(truth, SIGMA * rng.standard_normal(50))
-    surprises = np.array([abs(one.surprise[0]) for one in found])
-    assert surprises[:40].max() < 4
-    assert surprises[40] > 10
+    innovations = np.array([abs(one.innovation[0]) for one in found])
+    assert innovations[:40].max() < 4
+    assert innovations[40] > 10
 
 
 def test_errors_cover_what_bends_within_the_memory():

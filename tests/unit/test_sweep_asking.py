@@ -1,4 +1,4 @@
-"""What may be swept where; a sweep on an open bench, as on hardware; conclusions from made-up loops."""
+"""Search space by system; a sweep on an open bench, as on hardware; results of synthetic loops."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ import importlib.util
 
 import numpy as np
 import pytest
-from made_up_sweep import SWEPT, made_up
 from small_system import SMALL, configuration
+from synthetic_sweep import SWEPT, synthetic_run
 
 import escape_hw
 from escape_hw.api.procedure import run
@@ -15,15 +15,15 @@ from escape_hw.config.loader import load_system
 from escape_hw.errors import ConfigError
 from escape_hw.io.provenance import file_sha256
 from escape_hw.runtime.sweep.description import SweepDescription, read_description
-from escape_hw.runtime.sweep.design import Design, MatrixVariant
+from escape_hw.runtime.sweep.design import Design, MatrixVariant, Sweep
 from escape_hw.runtime.sweep.products import criteria, sweep_document, trials_csv
 from escape_hw.runtime.sweep.request import parse_search_space, require_loop_frames, require_optuna
 from escape_hw.runtime.sweep.result import analyse_sweep
-from escape_hw.runtime.sweep.run import Sweep, run_sweep
+from escape_hw.runtime.sweep.run import run_sweep
 from escape_hw.runtime.sweep.search_space import default_space, parse_parameter
 
 
-def test_hardware_wants_a_persons_limits_on_everything():
+def test_hardware_needs_limits_for_every_parameter():
     config = load_system("razor-shwfs", mode="hardware")
     with pytest.raises(ConfigError, match="leak, dropped_modes"):
         parse_search_space(config, ["gain=0.1:0.5"])
@@ -66,9 +66,9 @@ def test_without_a_science_camera_there_is_nothing_to_judge_by():
 
 def test_ranges_beyond_the_configurations_are_refused():
     for text in ("gain=0.1:9", "leak=0:2", "dropped_modes=0:30", "twin.loss_probability=0:0.9", "twin.x=0:1"):
-        arm = MatrixVariant("A", False, __file__, "")
+        variant = MatrixVariant("A", False, __file__, "")
         space = default_space(30, [parse_parameter(text)])
-        swept = Sweep(configuration().to_toml(), (arm,), space, Design(), 100, 1)
+        swept = Sweep(configuration().to_toml(), (variant,), space, Design(), 100, 1)
         with pytest.raises(ConfigError, match=text.partition("=")[0]):
             SweepDescription(swept, "sqlite://", "s", "random", 0.01).validate()
 
@@ -76,11 +76,11 @@ def test_ranges_beyond_the_configurations_are_refused():
 def test_passwords_are_not_written(tmp_path):
     (tmp_path / "im.fits").write_bytes(b"")
     path = tmp_path / "im.fits"
-    arm = MatrixVariant("A", False, path, file_sha256(path))
+    variant = MatrixVariant("A", False, path, file_sha256(path))
     space = default_space(30, [parse_parameter("gain=0.1:1")])
-    swept = Sweep(configuration().to_toml(), (arm,), space, Design(), 100, 1)
+    swept = Sweep(configuration().to_toml(), (variant,), space, Design(), 100, 1)
     url = "postgresql+psycopg://me:secret@host/sweeps"
-    assert "secret" not in SweepDescription(swept, url, "s", "random", 0.01).keep(tmp_path).read_text()
+    assert "secret" not in SweepDescription(swept, url, "s", "random", 0.01).save(tmp_path).read_text()
     with pytest.raises(ConfigError, match="--storage"):
         read_description(tmp_path)
     assert read_description(tmp_path, url).storage == url
@@ -97,16 +97,18 @@ def test_a_sweep_on_an_open_bench(tmp_path):
         path = escape_hw.save_matrix(tmp_path / "im.fits", bench.calibrate("push-pull"))
         np.save(tmp_path / "psf.npy", bench.take_model_psf())
         sent = []
-        arms = tuple(MatrixVariant(name, False, path, file_sha256(path)) for name in ("A", "B"))
+        variants = tuple(MatrixVariant(name, False, path, file_sha256(path)) for name in ("A", "B"))
         space = tuple(parse_parameter(t) for t in ("gain=0.3:0.6", "leak=0.01", "dropped_modes=2:6"))
         swept = Sweep(
-            bench.config.to_toml(), arms, space, Design(4, 1, 1, 6), 200, 1,
+            bench.config.to_toml(), variants, space, Design(4, 1, 1, 6), 200, 1,
             psf=str(tmp_path / "psf.npy"), simulated=False,
         )  # fmt: skip
-        kept = SweepDescription(swept, f"sqlite:///{tmp_path / 'study.db'}", "s", "random", 0.05).validate()
-        kept.save(tmp_path)
-        assert read_description(tmp_path) == kept
-        found = run(run_sweep(swept, kept.store(), bench), observers=(sent.append,))
+        description = SweepDescription(
+            swept, f"sqlite:///{tmp_path / 'study.db'}", "s", "random", 0.05
+        ).validate()
+        description.save(tmp_path)
+        assert read_description(tmp_path) == description
+        found = run(run_sweep(description.open_study(), bench), observers=(sent.append,))
         assert np.all(bench.dm.shape == 0)
     result = analyse_sweep(swept, found, 0.05)
     assert len(found.records) == 4 + 2 + 12
@@ -126,7 +128,7 @@ def test_a_sweep_on_an_open_bench(tmp_path):
     ("difference", "word"), [(0.0, "equivalent"), (0.05, "ESCAPE better"), (-0.05, "worse")]
 )
 def test_conclusions(difference, word):
-    result = analyse_sweep(SWEPT, made_up(difference), 0.01)
+    result = analyse_sweep(SWEPT, synthetic_run(difference), 0.01)
     (one,) = result.comparisons
     assert one.found.mean == pytest.approx(difference, abs=0.005)
     assert (word if word != "worse" else "push-pull better than ESCAPE") in one.text

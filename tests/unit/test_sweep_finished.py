@@ -7,8 +7,8 @@ from pathlib import Path
 
 import fake_results as fake
 import pytest
-from made_up_sweep import SWEPT, made_up
 from small_system import configuration
+from synthetic_sweep import SWEPT, synthetic_run
 
 from escape_hw.io.documents import dumps, header_fields
 from escape_hw.io.fits.matrix import save_matrix
@@ -25,18 +25,18 @@ def description(tmp_path: Path) -> SweepDescription:
     """A sweep of two matrices in the folder ``run``."""
     config, run = configuration(), tmp_path / "run"
     path = save_matrix(tmp_path / "im.fits", fake.calibration(), fake.ORIGIN)
-    arms = tuple(MatrixVariant(name, False, path, file_sha256(path)) for name in ("push-pull", "ESCAPE"))
-    swept = replace(SWEPT, config=config.to_toml(), arms=arms)
+    variants = tuple(MatrixVariant(name, False, path, file_sha256(path)) for name in ("push-pull", "ESCAPE"))
+    swept = replace(SWEPT, config=config.to_toml(), variants=variants)
     one = SweepDescription(swept, f"sqlite:///{run / 'study.db'}", "sweep", "random", 0.01)
     with RunFolder("razor-shwfs", "sweep", run) as folder:
         folder.write_config(config.to_toml())
-        one.keep(folder.path)
+        one.save(folder.path)
     return one
 
 
 def conclude_in(path: Path, description: SweepDescription, partial: bool = False) -> Path:
     """What a sweep writes at its end."""
-    run = made_up(0.0)
+    run = synthetic_run(0.0)
     run.partial = partial
     document = {
         **header_fields("sweep", "razor-shwfs", True, 1),
@@ -61,7 +61,7 @@ def test_resume_of_a_finished_sweep_shows_its_result(
 ):
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
     there = conclude_in(tmp_path / where, description)
-    description.store().set_result_folder(str(there))
+    description.open_study().set_result_folder(str(there))
     before = sorted(path.name for path in tmp_path.iterdir())
     code, out, err = escape("sweep", "--resume", tmp_path / "run", "--out", tmp_path / "again")
     assert code == 0
@@ -75,5 +75,5 @@ def test_resume_of_a_finished_sweep_shows_its_result(
 
 
 def test_a_result_that_has_gone_is_made_again(description: SweepDescription, tmp_path: Path) -> None:
-    description.store().set_result_folder(str(tmp_path / "gone"))
+    description.open_study().set_result_folder(str(tmp_path / "gone"))
     assert find_finished_result(tmp_path / "run", description) is None

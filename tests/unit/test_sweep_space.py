@@ -19,7 +19,7 @@ from escape_hw.runtime.sweep.search_space import (
 from escape_hw.runtime.sweep.study import LoopRecord
 from escape_hw.runtime.sweep.trials import TrialSpec
 
-ARMS = [MatrixVariant(name, False, __file__, "") for name in ("A", "B", "C")]
+VARIANTS = [MatrixVariant(name, False, __file__, "") for name in ("A", "B", "C")]
 
 
 @pytest.mark.parametrize(
@@ -35,7 +35,7 @@ ARMS = [MatrixVariant(name, False, __file__, "") for name in ("A", "B", "C")]
         ("gain=0.4", Choices("gain", (0.4,))),
     ],
 )
-def test_texts_and_parameters(text, want):
+def test_parameters_are_read_from_text_and_written(text, want):
     assert parse_parameter(text) == want
     assert parse_parameter(want.to_text()) == want
 
@@ -46,7 +46,7 @@ def test_what_cannot_be_read_is_refused(text):
         parse_parameter(text)
 
 
-def test_given_ranges_replace_the_usual_ones_and_extend_them():
+def test_given_ranges_replace_the_default_ones_and_extend_them():
     space = default_space(30, [parse_parameter("gain=0.4"), parse_parameter("twin.latency_s=0:1e-3")])
     assert [one.key for one in space] == ["gain", "leak", "dropped_modes", "twin.latency_s"]
     assert space[0].at(0.7) == 0.4
@@ -64,23 +64,27 @@ def test_draws_fill_the_range(one):
     assert unit_coordinate(one, values[50]) == pytest.approx(0.5, abs=0.06)
 
 
-def test_every_arm_draws_the_same_on_the_same_air():
+def test_all_variants_draw_the_same_parameters_on_the_same_turbulence():
     space = default_space(30, [])
-    slots = list(Design(trials=9).exploration_slots(ARMS))
-    assert [(slot.arm, slot.index) for slot in slots[:4]] == [("A", 0), ("B", 0), ("C", 0), ("A", 1)]
+    slots = list(Design(trials=9).exploration_slots(VARIANTS))
+    assert [(slot.variant, slot.index) for slot in slots[:4]] == [("A", 0), ("B", 0), ("C", 0), ("A", 1)]
     assert draw_parameters(space, 1, slots[0].index) == draw_parameters(space, 1, slots[2].index)
     assert draw_parameters(space, 1, 0) != draw_parameters(space, 1, 1)
     assert draw_parameters(space, 1, 0) != draw_parameters(space, 2, 0)
 
 
-def test_no_two_stages_share_their_air():
+def test_no_two_stages_share_their_turbulence():
     design = Design(trials=6)
-    stages = (design.exploration_slots(ARMS), design.shortlist_slots(ARMS), design.final_slots(ARMS))
+    stages = (
+        design.exploration_slots(VARIANTS),
+        design.shortlist_slots(VARIANTS),
+        design.final_slots(VARIANTS),
+    )
     seeds = [{slot.run_seed(7) for slot in stage} for stage in stages]
     assert len(seeds[0] | seeds[1] | seeds[2]) == sum(map(len, seeds))
     assert (
         design.n_loops(3)
-        == sum(len(list(s)) for s in (design.exploration_slots(ARMS), design.final_slots(ARMS))) + 36
+        == sum(len(list(s)) for s in (design.exploration_slots(VARIANTS), design.final_slots(VARIANTS))) + 36
     )
 
 
@@ -102,7 +106,7 @@ def test_diverged_loops_are_never_shortlisted():
     assert shortlist(records, space, "A", 4) == []
 
 
-def test_a_task_changes_what_is_varied_and_the_air_but_not_the_bench():
+def test_a_task_changes_what_is_varied_and_the_turbulence_but_not_the_bench():
     config = configuration()
     values = {"gain": 0.3, "leak": 0.01, "dropped_modes": 2, "delay": 1.5, "twin.wfs.read_noise_e": 12.0}
     task = TrialSpec(config.to_toml(), "x.fits", "", None, values, 100, 17)

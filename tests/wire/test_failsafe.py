@@ -1,4 +1,7 @@
-"""The fail-safe process with an adaptive secondary: a floating shell is rested, a rested one is not lifted."""
+"""The fail-safe process with an adaptive secondary.
+
+A floating shell is rested, a rested one is not lifted.
+"""
 
 from __future__ import annotations
 

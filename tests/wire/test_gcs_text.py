@@ -73,7 +73,7 @@ def test_garbage_neither_hangs_nor_crashes_the_reader(noise):
             try:
                 parse(reply)
             except MalformedReply as error:
-                assert str(error)
+                assert str(error)  # noqa: PT017
 
 
 def test_a_reply_without_end_is_given_up(monkeypatch):

@@ -10,6 +10,7 @@ import tempfile
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
+from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -41,7 +42,7 @@ def run() -> list[BenchmarkRow]:
 
 
 def _row(system: str, frames: int) -> BenchmarkRow:
-    from escape_hw.runtime.sweep.trials import TrialSpec
+    from escape_hw.runtime.sweep.trials import TrialSpec, run_trial
     from escape_hw.runtime.sweep.workers import LocalWorkers
 
     with tempfile.TemporaryDirectory() as folder:
@@ -57,7 +58,7 @@ def _row(system: str, frames: int) -> BenchmarkRow:
                 seeds = range(LOOPS * number, LOOPS * (number + 1))
                 for count in (1, 2):
                     tasks = [TrialSpec(*task, values, frames, seed) for seed in seeds]
-                    loops[count].append(_rate(workers[count].submit, tasks))
+                    loops[count].append(_rate(partial(workers[count].submit, run_trial), tasks))
                     reference_rates[count].append(
                         _rate(reference_pools[count].submit, [_reference_work] * LOOPS)
                     )

@@ -1,4 +1,5 @@
-"""DO-CRIME: interaction matrix and temporal response from random pokes, in open and closed loop.
+"""DO-CRIME: interaction matrix, temporal response and whitening filter from random pokes.
 
-The modules ``acquisition``, ``open_loop`` and ``closed_loop`` move hardware; the others are pure numerics.
+The numerics are pure; ``acquisition``, ``open_loop`` and ``closed_loop`` move hardware. The mode-by-mode
+methods are in ``push_pull``.
 """

@@ -1,1 +1,5 @@
-"""The whole ESCAPE method: DO-CRIME, SPRINT and the pseudo-synthetic interaction matrix, also from fewer frames than modes. The individual steps are in docrime and sprint."""
+"""The whole ESCAPE method: DO-CRIME, SPRINT and the pseudo-synthetic interaction matrix.
+
+``short_runs`` covers runs of fewer frames than an interaction matrix takes. The steps are in ``docrime`` and
+``sprint``.
+"""

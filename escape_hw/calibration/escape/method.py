@@ -1,4 +1,4 @@
-"""ESCAPE: DO-CRIME, then SPRINT, then the pseudo-synthetic interaction matrix (the paper)."""
+"""The ESCAPE method: DO-CRIME, then SPRINT, then the pseudo-synthetic interaction matrix (the paper)."""
 
 from __future__ import annotations
 
@@ -15,25 +15,33 @@ from escape_hw.calibration.acquisition.checkpoint import Checkpoint
 from escape_hw.calibration.acquisition.stopping import Target
 from escape_hw.calibration.docrime.closed_loop import docrime_closed_run
 from escape_hw.calibration.docrime.fit import DocrimeSolution
-from escape_hw.calibration.docrime.open_loop import build_solution_matrix, docrime_run, minimum_frames
+from escape_hw.calibration.docrime.open_loop import (
+    DocrimeRun,
+    build_solution_matrix,
+    docrime_run,
+    minimum_frames,
+)
 from escape_hw.calibration.escape.short_runs import (
     calibrate_short_run,
     calibrate_short_run_closed_loop,
     fit_recorded_frames,
 )
 from escape_hw.calibration.modes.bases import build_modal_basis
-from escape_hw.calibration.sprint.fit import estimate_registration, sprint_options_from_config
+from escape_hw.calibration.sprint.fit import fit_registration, sprint_options_from_config
 from escape_hw.calibration.sprint.solvers import MATRIX_ONLY_SOLVERS
 from escape_hw.calibration.sprint.synthetic_matrix import synthesise_calibration
 from escape_hw.calibration.sprint.telemetry_fit import decorrelate_columns
 from escape_hw.config.choices import ESTIMATORS
+from escape_hw.config.system import CalibrationSection
+from escape_hw.deprecation import renamed_keywords
 from escape_hw.errors import Aborted, ConfigError
 
-#: Frames per mode below which the frames themselves are fitted even where there is a matrix: the errors of
-#: one from so few frames look like white noise in what it leaves, and the filter found on that is too weak.
+#: Frames per mode below which the recorded frames are fitted even though there is a matrix: the errors of
+#: such a matrix appear as white noise in its residual, so the whitening filter estimated from it is too weak.
 _FRAMES_PER_MODE = 10
 
 
+@renamed_keywords(closing="closed_loop", keep="checkpoint")
 def escape(
     bench: Bench,
     *,
@@ -46,59 +54,58 @@ def escape(
     until: Target | None = None,
     checkpoint: Checkpoint | None = None,
 ) -> Procedure[CalibrationResult]:
-    """Calibrate without a source: measure under turbulence, find the registration, synthesise.
+    """Calibrate without a source: measure under turbulence, fit the registration, synthesise the matrix.
+
+    A run of fewer frames than a measured matrix takes (:func:`is_short_run`) fits the registration once,
+    after its last frame.
 
     Parameters
     ----------
-    bench, frames, poke, grid, whiten
+    bench, frames, poke, whiten
         As for :func:`~escape_hw.calibration.docrime.open_loop.docrime`.
+    grid
+        Geometry of the sensor, if it is known; in closed loop that of ``closed_loop`` is used.
     estimator
-        ``"matrix"``: SPRINT fits the DO-CRIME matrix, mode by mode, as the paper does.
-        ``"telemetry"``: it fits what the whitened frames hold, which takes fewer frames than modes and
-        loses nothing (see :mod:`~escape_hw.calibration.sprint.telemetry_fit`). As configured by default;
-        ``"auto"`` is the second.
-    closing
-        Measure in closed loop, with this calibration's matrix
-        (:func:`~escape_hw.calibration.docrime.closed_loop.docrime_closed_loop`).
+        ``"matrix"``: SPRINT fits the DO-CRIME matrix, mode by mode, as the paper does. ``"telemetry"``: it
+        fits the whitened frames without loss of information, also fewer frames than modes
+        (:mod:`~escape_hw.calibration.sprint.telemetry_fit`). ``"auto"``: telemetry where possible. As
+        configured by default.
+    closed_loop
+        Calibration whose matrix closes the loop during the measurement; open loop by default.
     until
-        Stop before that number of frames when this is reached.
-    keep
-        Where the state is kept meanwhile, and what to go on with.
+        Target at which to stop before that number of frames. A short run has no measured matrix, so it
+        refuses a signal-to-noise ratio; it takes all its frames, and a note of the result says whether the
+        accuracy was reached.
+    checkpoint
+        File for the state of the run, from which it can be resumed. A short run refuses it.
 
     Returns
     -------
     CalibrationResult
-        ``matrix`` is pseudo-synthetic, ``measured`` the DO-CRIME matrix behind it (``None`` if there
-        were too few frames for one), ``registration`` what SPRINT found; ``registration.converged``
-        says whether to trust it. Stopped early, ``matrix`` is the DO-CRIME matrix, ``partial`` is true
-        and ``registration`` is ``None``.
+        ``matrix`` is pseudo-synthetic, ``measured`` the DO-CRIME matrix (``None`` for a short run),
+        ``registration`` the result of SPRINT; do not use the matrix unless ``registration.converged``. If
+        the run was aborted, ``matrix`` is the DO-CRIME matrix, ``partial`` is true and ``registration`` is
+        ``None``.
 
     Raises
     ------
     ConfigError
-        No such estimator, or the plain one in closed loop; nothing moved.
+        Unknown estimator, the plain estimator in closed loop, or a target or checkpoint that a short run
+        cannot have; nothing moved.
     TooFewFrames, CalibrationError, ProductError, Aborted
         As for DO-CRIME.
     """
     c = bench.config.calibration
-    estimator = c.estimator if estimator is None else estimator
-    if estimator not in ESTIMATORS:
-        raise ConfigError(f"estimator '{estimator}' is unknown; it is one of {', '.join(ESTIMATORS)}")
-    needs_matrix = c.solver in MATRIX_ONLY_SOLVERS
-    if needs_matrix and estimator == "telemetry":
-        raise ConfigError(
-            f"calibration.solver = '{c.solver}' fits modes, and telemetry has none; "
-            "choose estimator = 'matrix' or another solver"
-        )
-    from_matrix = estimator == "matrix" or not whiten or needs_matrix
+    from_matrix = _fits_matrix(c, whiten, estimator)
     n_frames = c.frames if frames is None else frames
     n_modes = bench.config.basis.n_modes if closed_loop is None else closed_loop.matrix.n_modes
-    if whiten and not from_matrix and n_frames < minimum_frames(c, n_modes):
-        if closed_loop is not None:
-            return (
-                yield from calibrate_short_run_closed_loop(bench, closed_loop, frames=n_frames, poke=poke)
-            )
-        return (yield from calibrate_short_run(bench, frames=n_frames, poke=poke, grid=grid))
+    if is_short_run(c, n_modes, frames=n_frames, whiten=whiten, estimator=estimator):
+        _require_short_run_options(until, checkpoint, n_frames, minimum_frames(c, n_modes), n_modes)
+        if closed_loop is None:
+            short = yield from calibrate_short_run(bench, frames=n_frames, poke=poke, grid=grid)
+        else:
+            short = yield from calibrate_short_run_closed_loop(bench, closed_loop, frames=n_frames, poke=poke)
+        return _note_accuracy(short, until)
     m2c = build_modal_basis(bench) if closed_loop is None else closed_loop.matrix.m2c
 
     def criterion(solution: DocrimeSolution, grid: SensorGeometry) -> Procedure[bool]:
@@ -107,7 +114,7 @@ def escape(
             return False
         if until.accuracy is None:
             return True
-        estimate = yield from _fit_registration(bench, matrix, grid, solution, from_matrix)
+        estimate = yield from _fit_solution(bench, matrix, grid, solution, from_matrix)
         return estimate.converged and float(estimate.sigma[:2].max()) <= until.accuracy
 
     stop_condition = None if until is None else criterion
@@ -118,17 +125,74 @@ def escape(
             bench, closed_loop, frames=frames, poke=poke, checkpoint=checkpoint, criterion=stop_condition
         )
     else:
-        record_frames = not from_matrix and n_frames < _FRAMES_PER_MODE * n_modes
         run = yield from docrime_run(
-            bench,
-            frames=frames,
-            poke=poke,
-            grid=grid,
-            whiten=whiten,
-            checkpoint=checkpoint,
-            criterion=stop_condition,
-            record=record_frames,
+            bench, frames=frames, poke=poke, grid=grid, whiten=whiten, checkpoint=checkpoint,
+            criterion=stop_condition, record=not from_matrix and n_frames < _FRAMES_PER_MODE * n_modes,
+        )  # fmt: skip
+    return (yield from _synthesise_from_run(bench, run, from_matrix))
+
+
+def is_short_run(
+    c: CalibrationSection,
+    n_modes: int,
+    *,
+    frames: int | None,
+    whiten: bool = True,
+    estimator: str | None = None,
+) -> bool:
+    """Whether a run has fewer frames than a measured matrix takes, so that telemetry is fitted directly.
+
+    Parameters as for :func:`escape`. Raises :class:`ConfigError` for an unknown estimator, or one that does
+    not go with the configured solver.
+    """
+    n_frames = c.frames if frames is None else frames
+    return not _fits_matrix(c, whiten, estimator) and n_frames < minimum_frames(c, n_modes)
+
+
+def _fits_matrix(c: CalibrationSection, whiten: bool, estimator: str | None) -> bool:
+    """Whether SPRINT fits the columns of a matrix as modes, rather than the whitened frames."""
+    estimator = c.estimator if estimator is None else estimator
+    if estimator not in ESTIMATORS:
+        raise ConfigError(f"estimator '{estimator}' is unknown; it is one of {', '.join(ESTIMATORS)}")
+    needs_matrix = c.solver in MATRIX_ONLY_SOLVERS
+    if needs_matrix and estimator == "telemetry":
+        raise ConfigError(
+            f"calibration.solver = '{c.solver}' fits modes, and telemetry has none; "
+            "choose estimator = 'matrix' or another solver"
         )
+    return estimator == "matrix" or not whiten or needs_matrix
+
+
+def _require_short_run_options(
+    until: Target | None, checkpoint: Checkpoint | None, n_frames: int, needed: int, n_modes: int
+) -> None:
+    """Raise :class:`ConfigError` for options that need a measured matrix."""
+    reason = f"a run of {n_frames} frames is too short for a measured matrix of {n_modes} modes"
+    if checkpoint is not None:
+        raise ConfigError(
+            f"{reason} and cannot be resumed; leave out the checkpoint, or ask for at least {needed} frames"
+        )
+    if until is not None and until.snr is not None:
+        raise ConfigError(
+            f"{reason}, so it has no signal-to-noise ratio; ask for an accuracy instead, or for at least "
+            f"{needed} frames"
+        )
+
+
+def _note_accuracy(result: CalibrationResult, until: Target | None) -> CalibrationResult:
+    """The result of a short run, with a note on the accuracy that was asked for."""
+    if until is None or until.accuracy is None or result.registration is None:
+        return result
+    worst = float(result.registration.sigma[:2].max())
+    note = (
+        f"standard error of the shifts: {worst:.3g} % of a sub-aperture, accuracy asked for: "
+        f"{until.accuracy:g} % ({'reached' if worst <= until.accuracy else 'not reached; use more frames'})"
+    )
+    return replace(result, notes=(*result.notes, note))
+
+
+def _synthesise_from_run(bench: Bench, run: DocrimeRun, from_matrix: bool) -> Procedure[CalibrationResult]:
+    """Fit the registration of a DO-CRIME run and synthesise its matrix."""
     measured, solution = run.result, run.solution
     if measured.partial:
         return measured
@@ -138,49 +202,39 @@ def escape(
             fit = yield from fit_recorded_frames(bench, run.record, measured.matrix, measured.grid, order)
             estimate = fit.estimate
         else:
-            estimate = yield from _fit_registration(
-                bench, measured.matrix, measured.grid, solution, from_matrix
-            )
+            estimate = yield from _fit_solution(bench, measured.matrix, measured.grid, solution, from_matrix)
     except Aborted:
         return replace(measured, partial=True)
     synthetic = synthesise_calibration(bench, measured.grid, estimate, measured.matrix.m2c)
     metrics = {**measured.matrix.metrics, **synthetic.matrix.metrics}
+    # The error of the temporal response is common to all modes, so no fit to the matrix contains it.
+    gain = estimate.gain
+    gain_sigma = float(np.hypot(gain.sigma, gain.value * solution.gain_sigma))
     return replace(
         measured,
         matrix=replace(synthetic.matrix, metrics=metrics),
-        registration=_add_response_error(estimate, solution.gain_sigma),
+        registration=replace(estimate, gain=replace(gain, sigma=gain_sigma)),
         measured=measured.matrix,
         notes=(*measured.notes, *estimate.warnings, *estimate.notes),
     )
 
 
-def _fit_registration(
+def _fit_solution(
     bench: Bench,
     matrix: InteractionMatrix,
     grid: SensorGeometry,
     solution: DocrimeSolution,
     from_matrix: bool,
 ) -> Procedure[RegistrationEstimate]:
-    """SPRINT on a solution, mode by mode or with the whole covariance of its errors."""
+    """SPRINT on a DO-CRIME solution: on its modes, or on its columns with independent noise."""
     c = bench.config.calibration
     modes = min(c.sprint_modes, matrix.n_modes)
     if not from_matrix:
         matrix = decorrelate_columns(matrix, solution.gram, solution.variance)
         modes = matrix.n_modes
     yield Reporter("synthetic model", 1, "model")(0)
-    return (
-        yield from estimate_registration(
-            matrix,
-            bench.model(grid),
-            modes=modes,
-            covariance=solution.covariance,
-            update_priors=True,
-            **sprint_options_from_config(c),
-        )
-    )
-
-
-def _add_response_error(estimate: RegistrationEstimate, relative: float) -> RegistrationEstimate:
-    """The estimate with the error that all modes share, which no fit to a matrix can tell."""
-    gain = estimate.gain
-    return replace(estimate, gain=replace(gain, sigma=float(np.hypot(gain.sigma, gain.value * relative))))
+    fit = yield from fit_registration(
+        matrix, bench.model(grid), modes=modes, covariance=solution.covariance, update_priors=True,
+        **sprint_options_from_config(c),
+    )  # fmt: skip
+    return fit.estimate

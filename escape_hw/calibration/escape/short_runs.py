@@ -1,4 +1,7 @@
-"""ESCAPE from fewer frames than an interaction matrix takes, in open and in closed loop."""
+"""ESCAPE from fewer frames than an interaction matrix takes, in open and in closed loop.
+
+Such a run lasts less than a second. It cannot be resumed; an aborted one is discarded.
+"""
 
 from __future__ import annotations
 
@@ -26,6 +29,7 @@ from escape_hw.calibration.loop.divergence import require_not_diverged
 from escape_hw.calibration.loop.performance import collect_loop_notes
 from escape_hw.calibration.loop.runner import RunningLoop
 from escape_hw.calibration.modes.bases import build_modal_basis
+from escape_hw.calibration.sprint.fit import sprint_options_from_config
 from escape_hw.calibration.sprint.synthetic_matrix import synthesise_calibration
 from escape_hw.calibration.sprint.telemetry_fit import (
     MIN_WHITENED_FRAMES,
@@ -36,42 +40,43 @@ from escape_hw.calibration.sprint.telemetry_fit import (
 from escape_hw.config.system import CalibrationSection
 from escape_hw.errors import Aborted, TooFewFrames
 
-#: Frames per past frame of the whitening filter, so that there are enough to find it on.
+_NOTE = "too few frames for a measured matrix: the registration was fitted to the telemetry"
+#: Frames per past frame of the whitening filter, so that there are enough to estimate it.
 _FRAMES_PER_ORDER = 3
 
 
 def calibrate_short_run(
     bench: Bench, *, frames: int, poke: float | None = None, grid: SensorGeometry | None = None
 ) -> Procedure[CalibrationResult]:
-    """Registration straight from the telemetry of a few frames, and the pseudo-synthetic matrix.
+    """Fit the registration to the telemetry of a few frames in open loop, and synthesise the matrix.
 
     Parameters
     ----------
     bench
         An open bench, loop open.
     frames
-        Frames to take; they are also what the sensor's geometry is found on, unless ``grid`` is given.
+        Number of frames; the geometry of the sensor is found on them as well, unless ``grid`` is given.
     poke
         Pokes are uniform in +-poke on every mode, rms surface as fraction of full stroke.
     grid
-        The sensor's geometry, when it is known already.
+        Geometry of the sensor, if it is known.
 
     Returns
     -------
     CalibrationResult
-        Without a measured matrix, for which there are too few frames.
+        Without a measured matrix.
 
     Raises
     ------
     TooFewFrames
-        Fewer than a noise level can be told from; nothing moved.
+        Too few frames for an estimate of the noise; nothing moved.
     CalibrationError
         No spots or pupil images, no light, or no response.
     Aborted
-        Stopped early; frames this few are worth nothing by halves.
+        Stopped before the last frame.
     """
     c = bench.config.calibration
-    order, poke = whitening_order_for(c, frames), c.poke if poke is None else poke
+    order, poke = _choose_whitening_order(c, frames), c.poke if poke is None else poke
     m2c = build_modal_basis(bench)
     amplitude = compute_random_amplitudes(bench, m2c, poke)
     acquisition = OpenLoopAcquisition(bench, m2c, grid, min(SETUP_FRAMES, frames), None, store_samples=True)
@@ -83,8 +88,8 @@ def calibrate_short_run(
     record = acquisition.record()
     if record is None or acquisition.grid is None or acquisition.slope_statistics is None:
         raise RuntimeError("no frame was taken")
-    # The geometry was found on these very frames, so its lattice is where their mean spots stand. Images of
-    # the pupil have places of their own, which all frames tell best.
+    # The lattice of a Shack-Hartmann was fitted to the mean spots of these frames; the pupil images of a
+    # pyramid are located best on all frames.
     geometry = (
         acquisition.build_final_geometry()
         if acquisition.uses_run_mean
@@ -93,10 +98,10 @@ def calibrate_short_run(
     shape = (geometry.n_slopes, m2c.shape[1])
     template = build_interaction_matrix(bench, geometry, m2c, np.zeros(shape), np.zeros(shape), "telemetry")
     fit = yield from fit_recorded_frames(bench, record, template, geometry, order)
-    lost = int(record[0][-1] - record[0][0]) + 1 - record[0].size
-    result = build_short_run_result(
-        bench, fit, geometry, m2c, frames=int(record[0].size), lost=lost, poke=float(poke), order=order,
-        shortened=acquisition.shortened,
+    n_frames = int(record[0].size)
+    result = _build_result(
+        bench, fit, geometry, m2c, frames=n_frames, lost=int(record[0][-1] - record[0][0]) + 1 - n_frames,
+        poke=float(poke), order=order, shortened=acquisition.shortened,
     )  # fmt: skip
     return replace(
         result,
@@ -109,38 +114,26 @@ def calibrate_short_run(
 def fit_recorded_frames(
     bench: Bench, record: AcquisitionRecord, template: InteractionMatrix, grid: SensorGeometry, order: int
 ) -> Procedure[TelemetryFit]:
-    """SPRINT on the frames of an open-loop run.
+    """Fit the registration to the frames of an open-loop run.
 
     Parameters
     ----------
-    bench
-        An open bench.
     record
         Frame indices, slopes and pokes.
-    frame
-        A matrix of this sensor and basis; its data are not used.
-    grid
-        The geometry that the model is built on.
+    template, grid
+        A matrix of this sensor and basis, whose data are not used, and the geometry of the model.
     order
-        Of the whitening filter.
+        Order of the whitening filter.
     """
     c = bench.config.calibration
     data = telemetry_from_frames(*record, before=2 * c.whiten_order + c.lags)
-    fit = yield from fit_telemetry(
-        data, template, bench.model(grid), order=order, lags=c.lags, learning_rate=c.learning_rate,
-        solver=c.solver, loss=c.loss, also=c.extra_parameters, actuators=c.actuator_model,
-    )  # fmt: skip
-    return fit
+    options = sprint_options_from_config(c)
+    fit = fit_telemetry(data, template, bench.model(grid), order=order, lags=c.lags, options=options)
+    return (yield from fit)
 
 
-def whitening_order_for(c: CalibrationSection, frames: int) -> int:
-    """Order of the whitening filter that so many frames can carry.
-
-    Raises
-    ------
-    TooFewFrames
-        Fewer than a noise level can be told from.
-    """
+def _choose_whitening_order(c: CalibrationSection, frames: int) -> int:
+    """Order of the whitening filter for a number of frames; raises :class:`TooFewFrames`."""
     order = min(c.whiten_order, max(1, validate_frame_count(frames) // _FRAMES_PER_ORDER))
     least = MIN_WHITENED_FRAMES + min(order, 1)
     if frames < least:
@@ -148,7 +141,7 @@ def whitening_order_for(c: CalibrationSection, frames: int) -> int:
     return order
 
 
-def build_short_run_result(
+def _build_result(
     bench: Bench,
     fit: TelemetryFit,
     grid: SensorGeometry,
@@ -160,18 +153,7 @@ def build_short_run_result(
     order: int,
     shortened: int,
 ) -> CalibrationResult:
-    """The pseudo-synthetic matrix of a registration that came straight from telemetry.
-
-    Parameters
-    ----------
-    bench, grid, m2c
-        An open bench, the geometry that the model is built on, and the modes ``(n_act, n_modes)``.
-    fit
-        What the telemetry says.
-    frames, lost, poke, order, shortened
-        Frames taken and lost, poke (rms surface, fraction of full stroke), order of the whitening filter,
-        and commands that the limits cut.
-    """
+    """Calibration with the pseudo-synthetic matrix of a fit; ``shortened`` counts limited commands."""
     synthetic = synthesise_calibration(bench, grid, fit.estimate, m2c)
     metrics = {
         **synthetic.matrix.metrics, "frames": frames, "lost_frames": lost, "poke": poke,
@@ -184,68 +166,52 @@ def build_short_run_result(
         lost_frames=lost,
         sky_seconds=(frames + lost) / bench.wfs.settings.frame_rate_hz,
         response=fit.response,
-        notes=(
-            *fit.estimate.warnings,
-            *fit.estimate.notes,
-            "too few frames for a measured matrix: the registration comes straight from the telemetry",
-        ),
+        notes=(*fit.estimate.warnings, *fit.estimate.notes, _NOTE),
     )
 
 
 def calibrate_short_run_closed_loop(
     bench: Bench, closed_loop: CalibrationResult, *, frames: int, poke: float | None = None
 ) -> Procedure[CalibrationResult]:
-    """Registration straight from the telemetry of a few frames of a running loop.
+    """Fit the registration to the telemetry of a few frames of a closed loop, and synthesise the matrix.
+
+    Parameters and result as for :func:`calibrate_short_run`, except:
 
     Parameters
     ----------
-    bench
-        An open bench.
-    closing
-        A calibration whose matrix closes the loop.
+    closed_loop
+        Calibration whose matrix closes the loop, on whose grid the result is.
     frames
-        Frames with pokes in them. Those before them, in which the loop closes, are not counted.
-    poke
-        Pokes are uniform in +-poke on every mode, rms surface as fraction of full stroke.
-
-    Returns
-    -------
-    CalibrationResult
-        On the grid of ``closed_loop``, without a measured matrix, for which there are too few frames.
+        Number of frames with pokes, without those in which the loop settles.
 
     Raises
     ------
-    TooFewFrames
-        Fewer than a noise level can be told from; nothing moved.
+    TooFewFrames, Aborted
+        As for :func:`calibrate_short_run`.
     IncompatibleProduct
         The matrix belongs to another mirror, grid or camera region; nothing moved.
     CalibrationError
         The loop diverged, the sensor went dark, or it does not respond to the pokes.
-    Aborted
-        Stopped early; frames this few are worth nothing by halves.
     """
     c = bench.config.calibration
-    order, poke = whitening_order_for(c, frames), c.poke if poke is None else poke
+    order, poke = _choose_whitening_order(c, frames), c.poke if poke is None else poke
     control = build_integrator(bench, closed_loop.matrix, closed_loop.grid)
     loop = RunningLoop.prepare(bench, closed_loop.matrix, closed_loop.grid, control)
     past = 2 * c.whiten_order + c.lags
     buffer = TelemetryBuffer(closed_loop.grid.n_slopes, closed_loop.matrix.n_modes, past + frames, past)
     slope_statistics = SlopeStatistics(closed_loop.grid.n_slopes)
     yield from _record_frames(loop, frames, poke, past, buffer, slope_statistics)
-    geometry, data = (
-        slope_statistics.annotate_geometry(closed_loop.grid, closed=True),
-        _take_telemetry(buffer, c.whiten_order + c.lags),
-    )
+    geometry = slope_statistics.annotate_geometry(closed_loop.grid, closed=True)
+    data = _take_telemetry(buffer, c.whiten_order + c.lags)
     registration = closed_loop.registration
     fit = yield from fit_telemetry(
-        data, closed_loop.matrix, bench.model(geometry), order=order, lags=c.lags, known=closed_loop.response,
+        data, closed_loop.matrix, bench.model(geometry), order=order, lags=c.lags,
+        options=sprint_options_from_config(c), known_response=closed_loop.response,
         start=None if registration is None else registration.registration,
-        learning_rate=c.learning_rate, solver=c.solver, loss=c.loss, also=c.extra_parameters,
-        actuators=c.actuator_model,
     )  # fmt: skip
-    result = build_short_run_result(
-        bench, fit, geometry, closed_loop.matrix.m2c, frames=frames, lost=buffer.lost, poke=float(poke), order=order,
-        shortened=loop.record.shortened,
+    result = _build_result(
+        bench, fit, geometry, closed_loop.matrix.m2c, frames=frames, lost=buffer.lost, poke=float(poke),
+        order=order, shortened=loop.record.shortened,
     )  # fmt: skip
     notes = collect_loop_notes(loop.record, bench.wfs.settings.frame_rate_hz)
     return replace(result, grid=geometry, notes=(*result.notes, *notes))
@@ -259,7 +225,7 @@ def _record_frames(
     buffer: TelemetryBuffer,
     slope_statistics: SlopeStatistics,
 ) -> Procedure[None]:
-    """Close the loop, poke while the tape runs, open it; the mirror ends flat."""
+    """Close the loop, poke while the telemetry is recorded, and flatten the mirror."""
     bench = loop.bench
     amplitude = compute_random_amplitudes(bench, loop.m2c, poke)
     pokes = select_random_pokes(bench.config.calibration.pokes)(amplitude, bench.rng)
@@ -272,15 +238,15 @@ def _record_frames(
             observers = (buffer, lambda _index, slopes, _command, _poke: slope_statistics.add(slopes))
             yield from loop.run(frames, inject=pokes, observe=observers, report=Reporter(stage, frames))
         except Aborted:
+            n_frames = settling_frames + past + frames
             raise Aborted(
-                f"aborted after {loop.record.frames} of {settling_frames + past + frames} frames, too few for a "
-                "registration"
+                f"aborted after {loop.record.frames} of {n_frames} frames, too few for a registration"
             ) from None
     require_not_diverged(loop.record)
 
 
 def _take_telemetry(buffer: TelemetryBuffer, n_unknown: int) -> AlignedTelemetry:
-    """The tape; slopes whose commands of all lags and filters are not on it count as lost."""
+    """The recorded telemetry; slopes without known commands of all lags and filters count as lost."""
     data, _ = buffer.take_block()
     data.present[:n_unknown] = False
     data.slopes[:n_unknown] = 0

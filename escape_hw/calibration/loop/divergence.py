@@ -55,8 +55,9 @@ class DivergenceLimits:
 
     @classmethod
     def from_config(cls, config: SystemConfig) -> Self:
-        """Limits with ``server.diverging_factor`` and ``server.diverging_s`` of a configuration."""
-        return cls(config.server.diverging_factor, config.server.diverging_s)
+        """Limits of ``[server]``: ``diverging_factor``, ``diverging_s``, ``saturated_fraction``."""
+        server = config.server
+        return cls(server.diverging_factor, server.diverging_s, server.saturated_fraction)
 
 
 class SaturationMonitor:

@@ -276,7 +276,7 @@ def _fit_shapes(
             f"this mirror of {len(pupil_surfaces)} actuators cannot make {len(shapes)} independent {name} "
             "modes; lower basis.n_modes, or choose basis.kind = 'kl'"
         )
-    return scale_to_unit_rms(m2c, surfaces, pupil)
+    return scale_to_unit_rms(np.asarray(m2c, np.float64), surfaces, pupil)
 
 
 #: Bases that depend on the influence functions only.

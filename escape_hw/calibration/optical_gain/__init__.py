@@ -1,1 +1,5 @@
-"""Optical gains of the modes: comparison of two matrices, estimation from pokes in a running loop, smoothing over the modes, and the bootstrap that closes the loop with a matrix of unknown scale. The closed loop itself is in loop."""
+"""Optical gains of the modes.
+
+From the top: the bootstrap that closes the loop with a matrix of unknown scale, its first closure, estimation
+from pokes in closed loop, smoothing over the modes, and comparison of two matrices. The loop is in ``loop``.
+"""

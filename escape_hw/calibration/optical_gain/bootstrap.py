@@ -1,4 +1,7 @@
-"""Bootstrap of the optical gains (paper, PyWFS section): close the loop, measure, rescale, repeat with smaller pokes."""
+"""Bootstrap of the optical gains (paper, PyWFS section).
+
+Close the loop, measure the gains, rescale the matrix, and repeat with smaller pokes.
+"""
 
 from __future__ import annotations
 
@@ -24,33 +27,123 @@ from escape_hw.calibration.acquisition.pokes import (
 from escape_hw.calibration.optical_gain.estimator import GainMeasurementLoop, LoopSegment, OpticalGainEstimate
 from escape_hw.calibration.optical_gain.loop_closure import bootstrap_loop
 from escape_hw.calibration.optical_gain.matrix_comparison import scale_matrix
-from escape_hw.calibration.optical_gain.smoothing import smooth_over_modes, usable
+from escape_hw.calibration.optical_gain.smoothing import clip_gains, smooth_over_modes
+from escape_hw.deprecation import renamed_keywords
 from escape_hw.errors import Aborted, CalibrationError, ConfigError
 from escape_hw.pipeline.psf.strehl import strehl
 from escape_hw.pipeline.statistics import MIN_SAMPLES
 
-#: Poke of the first closure and first round; each round halves it.
+#: Poke of the first closure and the first round, and its factor from round to round.
 _FIRST_POKE, _POKE_FACTOR = 0.004, 0.5
-#: Frames per mode at each gain of the first closure, and at least.
+#: Frames per mode at each gain of the first closure, and their minimum.
 _FRAMES_PER_MODE, _MIN_FRAMES = 4, 400
-#: Accuracy of the rounds before the last poke, relative to the one asked for.
+#: Accuracy of the rounds before the last poke, relative to the final one.
 _EARLY_ACCURACY_FACTOR = 2.0
-#: Change between two rounds that counts as none, beside twice what the errors let expect.
+#: Change between two rounds that is negligible, as is twice the change expected from the errors.
 _TOLERANCE = 0.02
-#: Rounds at most at the last poke.
+#: Largest number of rounds at the last poke.
 _MAX_LAST_ROUNDS = 4
-#: How often, and by how much, the gain is lowered when a round finds the loop unstable.
+#: Largest number of reductions of the gain after an unstable round, and their factor.
 _MAX_RETRIES, _GAIN_REDUCTION = 3, 0.7
+#: Name of the closed-loop matrix among the comparisons.
+_CLOSED_LOOP_MATRIX = "shape"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GainsRun:
+    """Result of a bootstrap, and the calibration with the matrix scaled by its gains.
+
+    The matrix is unscaled if no round was finished.
+    """
+
+    result: GainsResult
+    rescaled_calibration: CalibrationResult
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__} {self.result!r}\n  rescaled: {self.rescaled_calibration.matrix!r}>"
+
+
+@renamed_keywords(beside="comparisons", shape="closed_loop_matrix")
+def bootstrap_gains(
+    bench: Bench,
+    calibration: CalibrationResult,
+    *,
+    poke: float = 0.002,
+    accuracy: float = 0.01,
+    budget: float = 0.01,
+    frames: int = 20000,
+    gain: float | None = None,
+    comparisons: Mapping[str, InteractionMatrix] | None = None,
+    closed_loop_matrix: InteractionMatrix | None = None,
+    model_psf: NDArray[np.float32] | None = None,
+) -> Procedure[GainsRun]:
+    """Close the loop with a matrix of unknown scale, and scale it mode by mode to the present turbulence.
+
+    Parameters
+    ----------
+    bench
+        An open bench, under the turbulence for which the gains are wanted.
+    calibration
+        A matrix of high signal-to-noise ratio, preferably pseudo-synthetic, with its geometry.
+    poke
+        Poke of each mode in the last rounds, rms surface as fraction of full stroke (paper: 0.001 to
+        0.002).
+    accuracy
+        Relative standard error of the gains at which a round ends, rms over the modes.
+    budget
+        Largest relative loss of Strehl ratio due to the last pokes, which are reduced to it.
+    frames
+        Largest number of frames per round.
+    gain
+        Effective gain of the loop; as configured by default.
+    comparisons
+        Other matrices by name, of the same geometry and modes, whose gains are measured as well.
+    closed_loop_matrix
+        A matrix of the same geometry and modes, of any scale, whose columns are more accurate in closed loop
+        (:func:`~escape_hw.calibration.sprint.synthetic_matrix.static_light_matrix`). It is scaled in the
+        end, by its own gains from the same frames. The gains of the result are those of ``calibration``.
+    model_psf
+        With it, and with a science camera, the Strehl ratio of every round is measured.
+
+    Returns
+    -------
+    GainsRun
+        Do not use the matrix unless ``result.converged``. ``result.partial`` is true if stopped early.
+
+    Raises
+    ------
+    ConfigError
+        A number is not between 0 and 1; nothing moved.
+    IncompatibleProduct
+        A matrix belongs to another mirror, grid or camera region; nothing moved.
+    CalibrationError
+        The loop does not close, or does not stay closed.
+    """
+    target_gain = bench.config.loop.gain if gain is None else gain
+    _require_fractions(poke=poke, accuracy=accuracy, budget=budget, gain=target_gain)
+    state, all_comparisons = _BootstrapState(), dict(comparisons or {})
+    if closed_loop_matrix is not None:
+        all_comparisons[_CLOSED_LOOP_MATRIX] = closed_loop_matrix
+    loop = GainMeasurementLoop(bench, calibration, all_comparisons, science=model_psf is not None)
+    with loop.closed():
+        try:
+            yield from _close_and_scale_loop(loop, target_gain, poke, state)
+            target = _BootstrapTarget(poke, accuracy, budget, frames, model_psf)
+            yield from _run_rounds(loop, target, list(all_comparisons), state)
+        except Aborted:
+            state.partial = True
+            _save_partial_round(loop, state)
+    return _build_run(loop, calibration, closed_loop_matrix, state, loop.lost_frames)
 
 
 @dataclass(slots=True, eq=False)
-class BootstrapState:
-    """What the bootstrap has so far."""
+class _BootstrapState:
+    """Intermediate results of a bootstrap."""
 
     applied: OpticalGains | None = None
     steps: list[ClosureStep] = field(default_factory=list)
     rounds: list[GainRound] = field(default_factory=list)
-    beside: dict[str, OpticalGains] = field(default_factory=dict)
+    comparisons: dict[str, OpticalGains] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     gain: float = math.nan
     amplitude: float = math.nan
@@ -60,8 +153,8 @@ class BootstrapState:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class BootstrapTarget:
-    """What :func:`~escape_hw.calibration.optical_gain.bootstrap.bootstrap_gains` is asked for."""
+class _BootstrapTarget:
+    """Options of :func:`bootstrap_gains`."""
 
     poke: float
     accuracy: float
@@ -70,40 +163,25 @@ class BootstrapTarget:
     model_psf: NDArray[np.float32] | None
 
 
-def close_and_scale_loop(
-    loop: GainMeasurementLoop, target_gain: float, poke: float, state: BootstrapState
+def _close_and_scale_loop(
+    loop: GainMeasurementLoop, target_gain: float, poke: float, state: _BootstrapState
 ) -> Procedure[None]:
-    """Close the loop at the effective gain wanted, and scale its matrix by what was measured."""
+    """Close the loop at an effective gain, and scale its matrix by the measured gains."""
     matrix = loop.reference
     amplitude = compute_poke_amplitudes(loop.bench, matrix.m2c, max(poke, _FIRST_POKE))
     frames = max(_FRAMES_PER_MODE * matrix.n_modes, _MIN_FRAMES)
     closure = yield from bootstrap_loop(loop, target_gain, amplitude, frames, state.steps)
-    state.applied = smooth_gains(closure.gains)
     state.gain = target_gain
-    _apply_gains(loop, state)
-    yield gain_progress(state)
+    _apply_gains(loop, state, _smooth(closure.gains))
+    yield _progress(state)
 
 
-def rounds(
-    loop: GainMeasurementLoop, target: BootstrapTarget, comparison_names: list[str], state: BootstrapState
+def _run_rounds(
+    loop: GainMeasurementLoop, target: _BootstrapTarget, comparison_names: list[str], state: _BootstrapState
 ) -> Procedure[None]:
-    """Measure and rescale with ever smaller pokes, until two rounds at the last poke agree.
+    """Measure and rescale with decreasing pokes until two rounds at the last poke agree.
 
-    Parameters
-    ----------
-    loop
-        Closed, its matrix scaled by the gains of the first closure.
-    asked
-        What to go on for.
-    others
-        Names of the loop's matrices beside the one that closes it.
-    state
-        Takes down what is found, as it goes.
-
-    Raises
-    ------
-    CalibrationError
-        The loop does not stay closed; says why.
+    Raises :class:`CalibrationError` if the loop does not stay closed.
     """
     poke_size, repeats = max(target.poke, _FIRST_POKE), 0
     min_frames = max(_FRAMES_PER_MODE * loop.reference.n_modes, _MIN_FRAMES)
@@ -111,12 +189,7 @@ def rounds(
         is_last_poke = poke_size <= target.poke
         amplitude = compute_poke_amplitudes(loop.bench, loop.reference.m2c, poke_size)
         if is_last_poke:
-            amplitude = scale_to_strehl_budget(
-                amplitude,
-                target.budget,
-                *_stroke_and_wavelength(loop.bench),
-                _poke_variance_factor(loop, state),
-            )
+            amplitude = scale_to_strehl_budget(amplitude, target.budget, *_strehl_cost(loop, state))
         state.amplitude = float(amplitude.max())
         accuracy = target.accuracy * (1 if is_last_poke else _EARLY_ACCURACY_FACTOR)
         segment = yield from loop.measure(
@@ -126,19 +199,21 @@ def rounds(
         if segment.diverged or segment.gains is None or _residual_is_high(segment, state):
             _lower_gain(loop, segment, state)
             continue
-        state.beside = {name: smooth_gains(segment.gains, k + 1) for k, name in enumerate(comparison_names)}
+        state.comparisons = {name: _smooth(segment.gains, k + 1) for k, name in enumerate(comparison_names)}
         _record_round(loop, segment, segment.gains, amplitude, accuracy, target.model_psf, state)
-        yield gain_progress(state)
-        state.converged = is_last_poke and _is_consistent(state.rounds[-1])
+        yield _progress(state)
+        last = state.rounds[-1]
+        is_confirmed = last.reached and last.change <= max(_TOLERANCE, 2 * last.expected_change)
+        state.converged = is_last_poke and is_confirmed
         repeats += is_last_poke
         poke_size = max(target.poke, poke_size * _POKE_FACTOR)
 
 
-def _lower_gain(loop: GainMeasurementLoop, segment: LoopSegment, state: BootstrapState) -> None:
-    """Open a loop that was not stable, and lower its gain; raises when that was done often enough."""
+def _lower_gain(loop: GainMeasurementLoop, segment: LoopSegment, state: _BootstrapState) -> None:
+    """Open an unstable loop and reduce its gain; raises after :data:`_MAX_RETRIES` reductions."""
     state.retries += 1
     if state.retries > _MAX_RETRIES:
-        reason = "diverged" if segment.diverged else (segment.reason or "swings")
+        reason = "diverged" if segment.diverged else (segment.reason or "oscillates")
         raise CalibrationError(
             f"the loop does not stay closed: at an effective gain of {state.gain:.2f} it {reason}; "
             "lower loop.gain, drop more modes, or measure the matrix again"
@@ -149,11 +224,9 @@ def _lower_gain(loop: GainMeasurementLoop, segment: LoopSegment, state: Bootstra
     loop.control.set_gain(state.gain)
 
 
-def gain_progress(state: BootstrapState) -> Progress:
-    """The gains so far, round by round."""
-    gains, count = state.applied, len(state.rounds)
-    if gains is None:
-        raise RuntimeError("no gains were measured yet")
+def _progress(state: _BootstrapState) -> Progress:
+    """The gains of all rounds so far."""
+    gains, count = _applied(state), len(state.rounds)
     arrays = {"gains": gains.value, "gains_sigma": gains.sigma, "gains_smooth": gains.trend}
     if count:
         arrays["gains_rounds"] = np.stack([one.gains.best for one in state.rounds])
@@ -162,12 +235,15 @@ def gain_progress(state: BootstrapState) -> Progress:
 
 
 def _is_accurate(measured: OpticalGainEstimate, target: float) -> bool:
-    """Whether gains are known as well as asked for."""
-    return _relative_error(smooth_gains(measured)) <= target
+    """Whether the relative error of the gains is below the target."""
+    return _relative_error(_smooth(measured)) <= target
 
 
-def _residual_is_high(segment: LoopSegment, state: BootstrapState) -> bool:
-    """Whether the residual is far above what it was: a pyramid's slopes saturate before the mirror does."""
+def _residual_is_high(segment: LoopSegment, state: _BootstrapState) -> bool:
+    """Whether the residual is far above those of the first closure.
+
+    The slopes of a pyramid saturate before the mirror does, so divergence is not detected by the limits.
+    """
     known = [step.residual_nm for step in state.steps if step.stable and math.isfinite(step.residual_nm)]
     return bool(known) and segment.residual_nm > 1.5 * max(known)
 
@@ -179,54 +255,46 @@ def _record_round(
     amplitude: NDArray[np.float64],
     accuracy: float,
     model_psf: NDArray[np.float32] | None,
-    state: BootstrapState,
+    state: _BootstrapState,
 ) -> None:
-    """Take down a round, and scale the matrix by what it found."""
-    smoothed_gains, previous = smooth_gains(measured), state.applied
-    if previous is None:
-        raise RuntimeError("the loop was never closed")
-    change = smoothed_gains.best / usable(previous) - 1
+    """Append a round to the results and scale the matrix by its gains."""
+    smoothed_gains, previous = _smooth(measured), _applied(state)
+    change = smoothed_gains.best / clip_gains(previous) - 1
     expected = np.hypot(smoothed_gains.best_sigma / smoothed_gains.best, previous.best_sigma / previous.best)
     expected = np.hypot(expected, math.hypot(smoothed_gains.common_sigma, previous.common_sigma))
     state.rounds.append(
         GainRound(
-            smoothed_gains,
-            float(amplitude.max()),
-            segment.frames,
-            rms(change),
-            rms(expected),
-            segment.residual_nm,
-            strehl_loss(amplitude, *_stroke_and_wavelength(loop.bench), _poke_variance_factor(loop, state)),
-            _relative_error(smoothed_gains) <= accuracy,
-            _strehl(segment, model_psf),
+            smoothed_gains, float(amplitude.max()), segment.frames, rms(change), rms(expected),
+            segment.residual_nm, strehl_loss(amplitude, *_strehl_cost(loop, state)),
+            _relative_error(smoothed_gains) <= accuracy, _strehl(segment, model_psf),
         )
-    )
-    state.applied = smoothed_gains
-    _apply_gains(loop, state)
+    )  # fmt: skip
+    _apply_gains(loop, state, smoothed_gains)
 
 
-def _apply_gains(loop: GainMeasurementLoop, state: BootstrapState) -> None:
-    """Scale the matrix by the gains; then the loop's own gain is the one wanted."""
+def _applied(state: _BootstrapState) -> OpticalGains:
+    """The gains by which the matrix in use is scaled."""
     if state.applied is None:
         raise RuntimeError("no gains were measured yet")
-    loop.scale(usable(state.applied))
+    return state.applied
+
+
+def _apply_gains(loop: GainMeasurementLoop, state: _BootstrapState, gains: OpticalGains) -> None:
+    """Scale the matrix by the gains, so that the gain of the integrator is the effective one."""
+    state.applied = gains
+    loop.scale(clip_gains(gains))
     loop.control.set_gain(state.gain)
 
 
 def _strehl(segment: LoopSegment, model_psf: NDArray[np.float32] | None) -> StrehlEstimate | None:
-    """Of the science frames of a round, when there were enough of them."""
+    """Strehl ratio of the science frames of a round; ``None`` if there are too few."""
     if model_psf is None or segment.record.science.count < MIN_SAMPLES:
         return None
     return strehl(segment.record.science.images(), model_psf)
 
 
-def _is_consistent(one: GainRound) -> bool:
-    """Whether a round found, to the accuracy asked for, the gains that it ran with."""
-    return one.reached and one.change <= max(_TOLERANCE, 2 * one.expected_change)
-
-
-def smooth_gains(measured: OpticalGainEstimate, reference: int = 0) -> OpticalGains:
-    """Gains relative to one of the loop's matrices, smoothed over the modes."""
+def _smooth(measured: OpticalGainEstimate, reference: int = 0) -> OpticalGains:
+    """Gains relative to one of the matrices of the loop, smoothed over the modes."""
     return smooth_over_modes(measured.value[reference], measured.sigma[reference], measured.common_sigma)
 
 
@@ -236,118 +304,25 @@ def _relative_error(gains: OpticalGains) -> float:
 
 
 def rms(values: NDArray[np.float64]) -> float:
-    """Root of the mean square."""
+    """Root mean square."""
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-def _stroke_and_wavelength(bench: Bench) -> tuple[float, float]:
-    return bench.dm.info.stroke_m, bench.config.system.wavelength_m
-
-
-def _poke_variance_factor(loop: GainMeasurementLoop, state: BootstrapState) -> float:
-    """Factor of the loop on the pokes' variance, by the delay known from the matrix."""
+def _strehl_cost(loop: GainMeasurementLoop, state: _BootstrapState) -> tuple[float, float, float]:
+    """Stroke [m], wavelength [m], and amplification of the variance of pokes by the loop."""
+    bench = loop.bench
     delay = float(loop.reference.metrics.get("delay_frames", 2.0))
-    return noise_gain(state.gain, loop.bench.config.loop.leak, delay)
+    factor = noise_gain(state.gain, bench.config.loop.leak, delay)
+    return bench.dm.info.stroke_m, bench.config.system.wavelength_m, factor
 
 
-#: Name of the matrix that only lends its shape, among those beside.
-_CLOSED_LOOP_MATRIX = "shape"
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class GainsRun:
-    """A bootstrap, and the matrix scaled by its gains: the one to close the loop with.
-
-    The matrix is as it was when no round was finished.
-    """
-
-    result: GainsResult
-    rescaled_calibration: CalibrationResult
-
-    def __repr__(self) -> str:
-        return f"<{type(self).__name__} {self.result!r}\n  rescaled: {self.rescaled_calibration.matrix!r}>"
-
-
-def bootstrap_gains(
-    bench: Bench,
-    calibration: CalibrationResult,
-    *,
-    poke: float = 0.002,
-    accuracy: float = 0.01,
-    budget: float = 0.01,
-    frames: int = 20000,
-    gain: float | None = None,
-    beside: Mapping[str, InteractionMatrix] | None = None,
-    shape: InteractionMatrix | None = None,
-    model_psf: NDArray[np.float32] | None = None,
-) -> Procedure[GainsRun]:
-    """Close the loop on a matrix of unknown scale, and scale it mode by mode to the turbulence there.
-
-    Parameters
-    ----------
-    bench
-        An open bench, under the turbulence that the gains are wanted for.
-    calibration
-        A matrix of high signal-to-noise ratio, best a pseudo-synthetic one, and its geometry.
-    poke
-        Last and smallest poke of each mode, rms surface as fraction of full stroke (paper: 0.001 to 0.002).
-    accuracy
-        Relative standard error of the gains to go on for, rms over the modes.
-    budget
-        Share of the Strehl ratio that the last pokes may cost; they are lowered to it.
-    frames
-        Frames per round at most.
-    gain
-        Effective gain of the loop; as configured by default.
-    beside
-        Other matrices by name, of the same geometry and modes, whose gains are wanted, too.
-    shape
-        A matrix of the same geometry and modes, of any scale, whose columns are better in closed loop
-        (:func:`~escape_hw.calibration.sprint.synthetic_matrix.at_rest`): the one that is scaled in the end, by gains
-        of its own that the same frames tell. The result's gains are those of ``calibration``.
-    model_psf
-        With it, and with a science camera, every round tells its Strehl ratio.
-
-    Returns
-    -------
-    GainsRun
-        ``result.converged`` says whether to trust it. Stopped early, ``result.partial`` is true.
-
-    Raises
-    ------
-    ConfigError
-        A number that means nothing; nothing moved.
-    IncompatibleProduct
-        A matrix belongs to another mirror, grid or camera region; nothing moved.
-    CalibrationError
-        The loop does not close, or does not stay closed; says why.
-    """
-    target_gain = bench.config.loop.gain if gain is None else gain
-    _require_fractions(poke=poke, accuracy=accuracy, budget=budget, gain=target_gain)
-    state, all_comparisons = (
-        BootstrapState(),
-        {**(beside or {}), **({} if shape is None else {_CLOSED_LOOP_MATRIX: shape})},
-    )
-    loop = GainMeasurementLoop(bench, calibration, all_comparisons, science=model_psf is not None)
-    with loop.closed():
-        try:
-            yield from close_and_scale_loop(loop, target_gain, poke, state)
-            yield from rounds(
-                loop, BootstrapTarget(poke, accuracy, budget, frames, model_psf), list(all_comparisons), state
-            )
-        except Aborted:
-            state.partial = True
-            _save_partial_round(loop, state)
-    return _build_run(loop, calibration, shape, state, loop.lost_frames)
-
-
-def _save_partial_round(loop: GainMeasurementLoop, state: BootstrapState) -> None:
-    """Keep what a round told that was aborted after enough frames; the loop is about to be opened."""
+def _save_partial_round(loop: GainMeasurementLoop, state: _BootstrapState) -> None:
+    """Append an aborted round if it had enough frames; the loop is opened next."""
     measured = loop.solve_latest()
     if state.applied is None or measured is None:
         return
-    smoothed_gains = smooth_gains(measured)
-    change = smoothed_gains.best / usable(state.applied) - 1
+    smoothed_gains = _smooth(measured)
+    change = smoothed_gains.best / clip_gains(state.applied) - 1
     state.rounds.append(
         GainRound(
             smoothed_gains, state.amplitude, measured.frames, rms(change), math.nan, math.nan, math.nan, False
@@ -365,24 +340,24 @@ def _require_fractions(**numbers: float) -> None:
 def _build_run(
     loop: GainMeasurementLoop,
     calibration: CalibrationResult,
-    shape: InteractionMatrix | None,
-    state: BootstrapState,
+    closed_loop_matrix: InteractionMatrix | None,
+    state: _BootstrapState,
     lost: int,
 ) -> GainsRun:
     rescaled_calibration, notes = calibration, list(state.notes)
-    closed_loop_gains = state.beside.pop(_CLOSED_LOOP_MATRIX, None)
+    closed_loop_gains = state.comparisons.pop(_CLOSED_LOOP_MATRIX, None)
     if state.rounds and state.applied is not None:
         scaled, gains = calibration.matrix, state.applied
-        # A run that was stopped early may not have told the other's gains.
-        if shape is not None and closed_loop_gains is not None:
-            scaled, gains = shape, closed_loop_gains
+        # An aborted run may lack the gains of the closed-loop matrix.
+        if closed_loop_matrix is not None and closed_loop_gains is not None:
+            scaled, gains = closed_loop_matrix, closed_loop_gains
         sigma = np.hypot(gains.best_sigma, gains.best * gains.common_sigma)
-        matrix = scale_matrix(scaled, usable(gains), sigma)
+        matrix = scale_matrix(scaled, clip_gains(gains), sigma)
         rescaled_calibration = replace(calibration, matrix=matrix, measured=None, partial=state.partial)
         if not state.rounds[-1].reached:
-            notes.append("the last round ended at its number of frames, before the accuracy asked for")
+            notes.append("the last round ended at its number of frames, before the requested accuracy")
     result = GainsResult(
         calibration.matrix.method, tuple(state.rounds), tuple(state.steps), state.converged, state.gain,
-        loop.frames, lost, state.beside, state.partial, tuple(notes),
+        loop.frames, lost, state.comparisons, state.partial, tuple(notes),
     )  # fmt: skip
     return GainsRun(result, rescaled_calibration)

@@ -1,4 +1,4 @@
-"""Optical gains from the telemetry of a running loop with pokes: the streaming estimator, and the loop that measures with it."""
+"""Optical gains from the telemetry of a closed loop with pokes: the loop, and the streaming estimator."""
 
 from __future__ import annotations
 
@@ -25,24 +25,24 @@ from escape_hw.errors import CalibrationError, IncompatibleProduct, TooFewFrames
 from escape_hw.pipeline.control.integrator import LeakyIntegrator
 from escape_hw.pipeline.control.reconstructor import reconstructor
 
-#: Frames per mode that the noise of the projected slopes is found on.
+#: Frames per mode from which the noise of the projected slopes is estimated.
 _NOISE_FRAMES_PER_MODE = 3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OpticalGainEstimate:
-    """Gains as measured.
+    """Optical gains estimated from telemetry.
 
     Parameters
     ----------
     value, sigma
-        ``(n_references, n_modes)``, relative to each reference.
+        Gains and standard errors ``(n_references, n_modes)``, relative to each reference.
     response
-        Response of the sensor to a step of the mirror, what was known before included.
+        Temporal response, earlier measurements included.
     common_sigma
-        Relative standard error that all gains share, from that of the response.
+        Relative standard error common to all gains, from that of the response.
     frames, lost_frames
-        That they came from.
+        Number of frames used and lost.
     """
 
     value: NDArray[np.float64]
@@ -53,29 +53,29 @@ class OpticalGainEstimate:
     lost_frames: int
 
     def mean(self) -> tuple[float, float]:
-        """Weighted mean over the modes of the first reference's gains, and its standard error."""
+        """Weighted mean of the gains relative to the first reference, and its standard error."""
         weights = self.sigma[0] ** -2.0
         value = float(np.average(self.value[0], weights=weights))
         return value, float(np.hypot(weights.sum() ** -0.5, value * self.common_sigma))
 
 
 class OpticalGainEstimator:
-    """Watches a loop and tells the optical gains of its modes; costs no more than a reconstructor.
+    """Streaming estimator of the optical gains; costs no more per frame than a reconstructor.
 
-    The slopes are projected on the reference's columns first
-    (:func:`~escape_hw.calibration.optical_gain.matrix_comparison.projector`), and what is left, a signal for each mode, goes
-    through the estimator of closed-loop DO-CRIME: the matrix that it finds is one between modes, with
-    the gains on its diagonal, and its errors know how slopes err together. The signals are turned so
-    that their noise is equal and independent, because the temporal response, which all modes share, is
-    found by weighing all of them alike. An observer of :class:`~escape_hw.calibration.loop.runner.RunningLoop`.
+    The slopes are projected on the columns of each reference
+    (:func:`~escape_hw.calibration.optical_gain.matrix_comparison.projector`), and the resulting signals, one
+    per mode, are processed by the estimator of closed-loop DO-CRIME: its matrix is one between modes, with
+    the gains on the diagonal, and its errors include the correlation of the slopes. The signals are whitened
+    over the modes first, because the temporal response, common to all modes, is fitted with equal weights.
+    An observer of :class:`~escape_hw.calibration.loop.runner.RunningLoop`.
 
     Parameters
     ----------
     references
-        Matrices that gains are wanted relative to, of the same slopes and modes.
+        Matrices relative to which gains are estimated, of the same slopes and modes.
     weights
-        Of the slopes ``(n_slopes,)``.
-    order, lags, known
+        Weights of the slopes ``(n_slopes,)``.
+    order, lags, known_response
         As for :class:`~escape_hw.calibration.docrime.estimator.DocrimeEstimator`.
     """
 
@@ -90,25 +90,17 @@ class OpticalGainEstimator:
     ) -> None:
         rows = np.concatenate([projector(reference, weights) for reference in references])
         self._rows = np.ascontiguousarray(rows, np.float32)
-        self._n_modes, self._order, self._lags, self._known_response = (
-            references[0].n_modes,
-            order,
-            lags,
-            known_response,
-        )
+        self._n_modes, self._order, self._lags = references[0].n_modes, order, lags
+        self._known_response = known_response
         self._signals = np.zeros(len(rows), np.float32)
         self._pending_frames: list[tuple[int, NDArray[np.float32], NDArray[np.float64]]] = []
         self._estimator: DocrimeEstimator | None = None
         self._signal_whitening = np.eye(len(rows))
 
     def __call__(
-        self,
-        index: int,
-        slopes: NDArray[np.float32],
-        command: NDArray[np.float64],
-        poke: NDArray[np.float64],
+        self, index: int, slopes: NDArray[np.float32], command: NDArray[np.float64], poke: NDArray[np.float64]
     ) -> None:
-        """Take one frame, the modal command that answered it and the poke in that command."""
+        """Add a frame, the modal command computed from it, and the poke in that command."""
         signals = np.dot(self._rows, slopes, out=self._signals)
         if self._estimator is not None:
             self._estimator.partial_fit(index, signals, command, poke)
@@ -118,51 +110,46 @@ class OpticalGainEstimator:
             self._start_estimator()
 
     def solve(self) -> OpticalGainEstimate:
-        """The gains so far.
+        """The gains from the frames so far.
 
         Raises
         ------
         TooFewFrames
-            Fewer complete frames than modes plus a margin.
+            Too few complete frames.
         CalibrationError
             The sensor does not respond to the pokes.
         """
         n, modes = self._n_modes, np.arange(self._n_modes)
         if self._estimator is None:
             raise TooFewFrames(
-                f"{len(self._pending_frames)} frames tell nothing of {n} modes; {3 * n} at least are needed"
+                f"{len(self._pending_frames)} frames cannot constrain the gains of {n} modes; at least "
+                f"{3 * n} are needed"
             )
         solution = self._estimator.solve()
         if solution.covariance is None:
-            raise RuntimeError("the estimator was not asked for correlations")
+            raise RuntimeError("the estimator did not compute the covariance of the noise")
         inverse_whitening = np.linalg.inv(self._signal_whitening)
         matrix = (inverse_whitening @ solution.matrix).reshape(-1, n, n)
-        # An element's variance is the noise of its signal times what the pokes of its mode leave.
+        # Variance of an element: noise of its signal over the power of the pokes of its mode.
         inverse_poke_power = np.square(solution.sigma[0]) / solution.variance[0]
         spread = solution.variance / np.diag(solution.covariance)
-        noise = np.einsum(
-            "ij,jk,ik->i",
-            inverse_whitening,
-            solution.covariance * np.sqrt(np.outer(spread, spread)),
-            inverse_whitening,
-        )
+        covariance = solution.covariance * np.sqrt(np.outer(spread, spread))
+        noise = np.einsum("ij,jk,ik->i", inverse_whitening, covariance, inverse_whitening)
         return OpticalGainEstimate(
             matrix[:, modes, modes],
             np.sqrt(np.maximum(noise, 0).reshape(-1, n) * inverse_poke_power),
             ResponseEstimate(solution.response.weights, solution.response_covariance),
-            solution.gain_sigma,
-            solution.frames,
-            solution.lost_frames,
-        )
+            solution.gain_sigma, solution.frames, solution.lost_frames,
+        )  # fmt: skip
 
     def _start_estimator(self) -> None:
-        """Find how the signals' noise is correlated, on the first frames, and go on with it turned."""
+        """Whiten the signals over the modes by the noise of the first frames, and start the estimator."""
         n, size = self._n_modes, len(self._rows)
         index = np.array([one[0] for one in self._pending_frames])
         signals = np.stack([one[1] for one in self._pending_frames])
         steps = np.diff(signals, axis=0)[np.diff(index) == 1].astype(np.float64)
         for start in range(0, size, n):
-            # Each reference by itself: the same slopes stand behind all of them.
+            # The signals of different references are combinations of the same slopes.
             block = slice(start, start + n)
             noise = np.atleast_2d(np.cov(steps[:, block].T))
             noise[np.diag_indices(n)] += 1e-3 * np.trace(noise) / n
@@ -178,15 +165,15 @@ class OpticalGainEstimator:
         self._pending_frames = []
 
 
-#: Frames after a change of gain or reconstructor that count for nothing.
+#: Frames after a change of gain or reconstructor that are not used.
 SETTLING_FRAMES = 60
-#: Frames between two looks at a running loop.
+#: Frames between two progress reports of the loop.
 _SEGMENT_FRAMES = 500
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoopSegment:
-    """What a stretch of the loop told: gains (``None``: no answer to the pokes), residual in nm."""
+    """A measurement in closed loop: gains (``None`` for the stated ``reason``), residual in nm."""
 
     gains: OpticalGainEstimate | None
     residual_nm: float
@@ -197,11 +184,10 @@ class LoopSegment:
 
 
 class GainMeasurementLoop:
-    """A loop whose pokes measure the optical gains of its matrix, and whose matrix can be scaled.
+    """A closed loop with pokes that measure the optical gains of its matrix, which can be rescaled.
 
-    Mirror and sensor answer in the same time from one measurement to the next, whatever the gains do: each
-    goes on with the temporal response that those before it found, from larger pokes as a rule. Measure within
-    ``with loop.closed():``.
+    The temporal response does not depend on the gains, so each measurement uses that of the earlier ones,
+    which usually had larger pokes. Measure within ``with loop.closed():``.
 
     Parameters
     ----------
@@ -209,10 +195,10 @@ class GainMeasurementLoop:
         An open bench.
     calibration
         The matrix that closes the loop, with its geometry.
-    beside
-        Other matrices of the same geometry and modes whose gains are wanted, too.
+    comparisons
+        Other matrices of the same geometry and modes whose gains are measured as well.
     science
-        Whether to gather the frames of the science camera.
+        Whether to accumulate the frames of the science camera.
 
     Raises
     ------
@@ -224,20 +210,20 @@ class GainMeasurementLoop:
         self,
         bench: Bench,
         calibration: CalibrationResult,
-        beside: Mapping[str, InteractionMatrix],
+        comparisons: Mapping[str, InteractionMatrix],
         *,
         science: bool = False,
     ) -> None:
         self.bench, self.reference = bench, calibration.matrix
-        for name, matrix in beside.items():
+        for name, matrix in comparisons.items():
             _require_same_modes(self.reference, name, matrix)
-        self._references = [self.reference, *beside.values()]
+        self._references = [self.reference, *comparisons.values()]
         self._weights = slope_weights(calibration.measured or self.reference)
         self.control: LeakyIntegrator = build_integrator(bench, self.reference, calibration.grid)
         self._dropped = bench.config.loop.dropped_modes
         self._stroke = np.sqrt(np.mean(np.square(self.reference.m2c), axis=0))
         self._known_response: ResponseEstimate | None = None
-        # Refused here, before anything moves, if a mode is noise.
+        # Raises, before anything moves, if a mode is dominated by noise.
         self._estimator = self._new_estimator()
         self._loop = RunningLoop.prepare(
             bench, self.reference, calibration.grid, self.control, science=science
@@ -259,12 +245,9 @@ class GainMeasurementLoop:
         self.control.reset()
 
     def scale(self, gains: NDArray[np.float64]) -> None:
-        """Go on with the matrix scaled by gains ``(n_modes,)``, without a bump.
+        """Exchange the reconstructor, bumplessly, for that of the matrix scaled by gains ``(n_modes,)``.
 
-        Raises
-        ------
-        CalibrationError
-            The scaled matrix cannot be inverted.
+        Raises :class:`CalibrationError` if the scaled matrix cannot be inverted.
         """
         matrix = scale_matrix(self.reference, gains)
         self.control.set_reconstructor(
@@ -280,20 +263,20 @@ class GainMeasurementLoop:
         max_frames: int | None = None,
         is_sufficient: Callable[[OpticalGainEstimate], bool] = lambda gains: True,
     ) -> Procedure[LoopSegment]:
-        """Poke and measure the gains, the loop staying closed.
+        """Poke and measure the gains in closed loop.
 
         Parameters
         ----------
         frames
-            Fewest frames.
+            Smallest number of frames.
         amplitude
-            Of each mode's pokes ``(n_modes,)``.
+            Amplitude of the pokes ``(n_modes,)``.
         stage
             Name of the stage in progress reports.
-        most
-            Frames to go on to until ``is_sufficient``; as ``frames`` by default.
-        enough
-            Asked now and then.
+        max_frames
+            Largest number of frames; ``frames`` by default.
+        is_sufficient
+            Criterion to stop, checked each time the number of frames has grown by a factor.
         """
         max_frames = frames if max_frames is None else max(max_frames, frames)
         pokes, loop, estimator = RandomPokes(amplitude, self.bench.rng), self._loop, self._new_estimator()
@@ -321,18 +304,15 @@ class GainMeasurementLoop:
         return LoopSegment(gains, rms, done, loop.record.diverged, loop.record, reason)
 
     def solve_latest(self) -> OpticalGainEstimate | None:
-        """What the last measurement found, also when it was aborted; ``None`` if it was too short."""
+        """Gains of the last measurement, even if aborted; ``None`` if it was too short."""
         return _try_solve(self._estimator)[0]
 
     def _new_estimator(self) -> OpticalGainEstimator:
         c = self.bench.config.calibration
         return OpticalGainEstimator(
-            self._references,
-            self._weights,
-            order=c.whiten_order,
-            lags=c.lags,
+            self._references, self._weights, order=c.whiten_order, lags=c.lags,
             known_response=self._known_response,
-        )
+        )  # fmt: skip
 
 
 def _require_same_modes(reference: InteractionMatrix, name: str, matrix: InteractionMatrix) -> None:
@@ -340,14 +320,14 @@ def _require_same_modes(reference: InteractionMatrix, name: str, matrix: Interac
     if not np.array_equal(matrix.valid, reference.valid):
         raise IncompatibleProduct(
             f"{name} was measured on other sub-apertures than the matrix that closes the loop, so its gains "
-            "cannot be told; measure it on the same geometry (grid= of the calibration)"
+            "cannot be measured; measure it on the same geometry (grid= of the calibration)"
         )
     if matrix.m2c.shape != reference.m2c.shape or not np.allclose(matrix.m2c, reference.m2c):
         raise IncompatibleProduct(f"{name} is of other modes than the matrix that closes the loop")
 
 
 def _try_solve(estimator: OpticalGainEstimator) -> tuple[OpticalGainEstimate | None, str]:
-    """The gains, or why there are none."""
+    """The gains, or the reason why there are none."""
     try:
         return estimator.solve(), ""
     except (TooFewFrames, CalibrationError) as error:

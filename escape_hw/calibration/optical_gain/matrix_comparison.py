@@ -1,4 +1,4 @@
-"""Optical gain of every mode from two interaction matrices, and what to do with it."""
+"""Optical gain of every mode from two interaction matrices, and scaling of a matrix by gains."""
 
 from __future__ import annotations
 
@@ -14,22 +14,27 @@ ValuesAndErrors = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 
 def deviation_ratio(measured: InteractionMatrix, reference: InteractionMatrix) -> ValuesAndErrors:
-    """The paper's estimator, ``OG_i = stdev(D_i) / stdev(Dhat_i)``, the deviation taken over slopes.
+    """Optical gains by the paper's estimator, ``OG_i = stdev(D_i) / stdev(Dhat_i)`` over the slopes.
 
-    Noise adds to a deviation and never takes from it, so a noisy column's gain comes out too large:
+    Noise increases a standard deviation, so the gain of a noisy column is biased to large values:
     ``E[stdev^2] = stdev_0^2 + mean(sigma^2)``. :func:`projection` has no such bias.
 
     Parameters
     ----------
     measured
-        Matrix around the wavefront that the gains are wanted for (the paper's D).
+        Matrix for the wavefront at which the gains are wanted (the paper's D).
     reference
-        Matrix around another wavefront.
+        Matrix for another wavefront.
 
     Returns
     -------
     value, sigma : ndarray, ``(n_modes,)``
-        Standard errors hold for elements that err independently, and leave out the bias.
+        The standard errors assume independent elements and do not include the bias.
+
+    Raises
+    ------
+    CalibrationError
+        The matrices have different slopes or modes, or a mode of the reference is empty.
     """
     _require_same_basis(measured, reference)
     measured_deviation, measured_variance = _deviation(measured)
@@ -38,31 +43,29 @@ def deviation_ratio(measured: InteractionMatrix, reference: InteractionMatrix) -
         raise CalibrationError(f"mode {int(np.argmin(reference_deviation))} of the reference matrix is empty")
     value = measured_deviation / reference_deviation
     with np.errstate(divide="ignore", invalid="ignore"):
-        relative = (
-            np.where(measured_deviation > 0, measured_variance / measured_deviation**2, np.inf)
-            + reference_variance / reference_deviation**2
-        )
+        relative = np.where(measured_deviation > 0, measured_variance / measured_deviation**2, np.inf)
+        relative = relative + reference_variance / reference_deviation**2
     return value, value * np.sqrt(relative)
 
 
 def _deviation(matrix: InteractionMatrix) -> ValuesAndErrors:
-    """Standard deviation of every column over the slopes, and the variance of that."""
+    """Standard deviation of every column over the slopes, and the variance of that estimate."""
     data, noise = matrix.data.astype(np.float64), np.square(matrix.sigma, dtype=np.float64)
     centred = data - data.mean(axis=0)
     variance = np.mean(np.square(centred), axis=0)
     n = data.shape[0]
-    # Of a mean of squares of normal variables with these means and variances. The column holds the
-    # noise as well, hence the difference of the squares.
+    # Variance of a mean of squares of normal variables with these means and variances; the column contains
+    # the noise, hence the difference.
     spread = (4 * np.sum(centred**2 * noise, axis=0) - 2 * np.sum(noise**2, axis=0)) / n**2
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.sqrt(variance), np.where(variance > 0, np.maximum(spread, 0) / (4 * variance), 0.0)
 
 
 def slope_weights(matrix: InteractionMatrix) -> NDArray[np.float64]:
-    """Weight of every slope ``(n_slopes,)``: one over its mean noise variance in a measured matrix.
+    """Weight of every slope ``(n_slopes,)``, of mean 1: the inverse of its mean noise variance.
 
-    They are relative (mean 1), and common to all modes, because a slope's noise is the same whichever
-    mode is poked. A matrix without errors weighs all slopes alike.
+    The weights are common to all modes, because the noise of a slope does not depend on the poked mode.
+    Without standard errors they are equal.
     """
     variance = np.mean(np.square(matrix.sigma, dtype=np.float64), axis=1)
     if not (np.isfinite(variance).all() and (variance > 0).all()):
@@ -72,17 +75,17 @@ def slope_weights(matrix: InteractionMatrix) -> NDArray[np.float64]:
 
 
 def projector(reference: InteractionMatrix, weights: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Rows that take slopes to gains: ``P D`` has the optical gains of ``D`` on its diagonal.
+    """Matrix ``P`` that maps slopes to gains: ``P D`` has the optical gains of ``D`` on its diagonal.
 
-    ``P_m = r_m^T W / (r_m^T W r_m - sum(w sigma_m^2))``, with ``r`` the reference's columns. The
-    second term is what noise adds to a noisy reference's length, so that its gain is not too small.
+    ``P_m = r_m^T W / (r_m^T W r_m - sum(w sigma_m^2))``, with ``r_m`` the columns of the reference. The
+    second term corrects the bias due to the noise of the reference.
 
     Parameters
     ----------
     reference
-        Matrix that the gains are relative to.
+        Matrix relative to which the gains are defined.
     weights
-        Of the slopes ``(n_slopes,)``, not taken from the same data's values.
+        Weights of the slopes ``(n_slopes,)``, independent of the values of the data.
 
     Returns
     -------
@@ -91,22 +94,22 @@ def projector(reference: InteractionMatrix, weights: NDArray[np.float64]) -> NDA
     Raises
     ------
     CalibrationError
-        A mode of the reference is nothing but noise.
+        A mode of the reference is dominated by noise.
     """
     columns = reference.data.astype(np.float64)
     noise = np.nan_to_num(np.square(reference.sigma, dtype=np.float64), posinf=0.0)
-    length = weights @ np.square(columns)
-    true = length - weights @ noise
-    if not (true > 0.1 * length).all():
+    power = weights @ np.square(columns)
+    signal = power - weights @ noise
+    if not (signal > 0.1 * power).all():
         raise CalibrationError(
-            f"mode {int(np.argmin(true / np.maximum(length, 1e-300)))} of the reference matrix is noise; "
+            f"mode {int(np.argmin(signal / np.maximum(power, 1e-300)))} of the reference matrix is noise; "
             "measure it with more frames, or use a pseudo-synthetic one"
         )
-    return np.asarray((columns * weights[:, None] / true).T)
+    return np.asarray((columns * weights[:, None] / signal).T)
 
 
 def projection(measured: InteractionMatrix, reference: InteractionMatrix) -> ValuesAndErrors:
-    """Optical gains by weighted regression of a matrix on a reference, which noise does not bias.
+    """Optical gains by weighted regression of a matrix on a reference, without bias from noise.
 
     ``g_m = r_m^T W d_m / (r_m^T W r_m - sum(w sigma^2))`` with weights from the standard errors.
 
@@ -118,8 +121,13 @@ def projection(measured: InteractionMatrix, reference: InteractionMatrix) -> Val
     Returns
     -------
     value, sigma : ndarray, ``(n_modes,)``
-        Standard errors hold for elements that err independently; those of a run whose slopes err
-        together come from the run itself (:class:`~escape_hw.calibration.optical_gain.estimator.OpticalGainEstimator`).
+        The standard errors assume independent elements; for correlated slopes use
+        :class:`~escape_hw.calibration.optical_gain.estimator.OpticalGainEstimator`.
+
+    Raises
+    ------
+    CalibrationError
+        As for :func:`deviation_ratio`, or a mode of the reference is dominated by noise.
     """
     _require_same_basis(measured, reference)
     weights = slope_weights(measured)
@@ -135,31 +143,27 @@ def projection(measured: InteractionMatrix, reference: InteractionMatrix) -> Val
 def scale_matrix(
     matrix: InteractionMatrix, gains: NDArray[np.float64], sigma: NDArray[np.float64] | None = None
 ) -> InteractionMatrix:
-    """The matrix around the wavefront that the gains were measured on (paper: ``OG . D``).
+    """The matrix for the wavefront at which the gains were measured (paper: ``OG . D``).
 
     Parameters
     ----------
     matrix
         ``(n_slopes, n_modes)``.
     gains, sigma
-        Gain of every mode and its standard error ``(n_modes,)``, which adds to the elements'.
+        Gain of every mode and its standard error ``(n_modes,)``, which is added to those of the elements.
 
     Raises
     ------
     ValueError
-        Gains that are not positive and finite, or not one per mode.
+        The gains are not positive and finite, or not one per mode.
     """
     if gains.shape != (matrix.n_modes,) or not (np.isfinite(gains).all() and (gains > 0).all()):
         raise ValueError(f"{matrix.n_modes} positive optical gains are needed, not {gains}")
     error = np.zeros_like(gains) if sigma is None else sigma
     variance = np.square(matrix.sigma * gains) + np.square(matrix.data * error)
     metrics = {**matrix.metrics, "optical_gain": float(np.mean(gains))}
-    return replace(
-        matrix,
-        data=(matrix.data * gains).astype(np.float32),
-        sigma=np.sqrt(variance).astype(np.float32),
-        metrics=metrics,
-    )
+    scaled, scaled_sigma = (matrix.data * gains).astype(np.float32), np.sqrt(variance).astype(np.float32)
+    return replace(matrix, data=scaled, sigma=scaled_sigma, metrics=metrics)
 
 
 def _require_same_basis(measured: InteractionMatrix, reference: InteractionMatrix) -> None:
@@ -167,7 +171,7 @@ def _require_same_basis(measured: InteractionMatrix, reference: InteractionMatri
     if measured.data.shape != reference.data.shape or not np.array_equal(measured.valid, reference.valid):
         raise CalibrationError(
             f"matrices of {measured.data.shape} and {reference.data.shape} slopes and modes, or with other "
-            "valid sub-apertures, have no common optical gain; measure both on the same geometry"
+            "valid sub-apertures, have no optical gain; measure both on the same geometry"
         )
     if not np.allclose(measured.m2c, reference.m2c):
         raise CalibrationError("the matrices are of different modes; measure both in the same basis")

@@ -1,4 +1,4 @@
-"""Optical gains as a function of the mode number: Legendre curves, and a smoothing spline with independent departures."""
+"""Optical gains over the modes: a smoothing spline with independent departures, and Legendre curves."""
 
 from __future__ import annotations
 
@@ -10,105 +10,74 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
 from escape_hw.api.optical_gains import OpticalGains
+from escape_hw.calibration.optical_gain.matrix_comparison import ValuesAndErrors
 from escape_hw.errors import CalibrationError
 
-#: Prior scatter of the coefficients, relative to the common gain: slope, bend, S-shape.
-COEFFICIENT_SIGMA = (0.3, 0.15, 0.08)
-
-
-def gain_curve_basis(n_modes: int, coefficients: int = len(COEFFICIENT_SIGMA)) -> NDArray[np.float64]:
-    """Curves over the modes per standard deviation of their coefficient ``(coefficients, n_modes)``.
-
-    Parameters
-    ----------
-    n_modes
-        Number of modes, in the order of a Karhunen-Loeve basis.
-    coefficients
-        How many, at most as many as :data:`COEFFICIENT_SIGMA` has.
-    """
-    x = np.sqrt(np.arange(1, n_modes + 1))
-    x = (2 * x - x[0] - x[-1]) / max(x[-1] - x[0], 1.0)
-    each = np.diag((0.0, *COEFFICIENT_SIGMA))[1 : coefficients + 1]
-    return np.stack([legendre.legval(x, one) for one in each]) if coefficients else np.zeros((0, n_modes))
-
-
-def compute_command_curves(m2c: NDArray[np.float64], basis: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-    """What turns a command into the change that each curve makes of it ``(n_act, n_act)``.
-
-    Parameters
-    ----------
-    m2c
-        Mode-to-command matrix ``(n_act, n_modes)``.
-    basis
-        From :func:`gain_curve_basis`.
-    """
-    to_modes = np.linalg.pinv(m2c)
-    return [(m2c * curve) @ to_modes for curve in basis]
-
-
-ValuesAndErrors = tuple[NDArray[np.float64], NDArray[np.float64]]
-
-#: Sizes tried of the trend's bends and of the modes' own departures, relative to the mean gain; the
-#: latter evenly spaced: a standard deviation's flat prior, which keeps small groups honest (Gelman 2006).
+#: Grids of the curvature of the trend and of the standard deviation of the departures, relative to the mean
+#: gain; the latter evenly spaced, a flat prior of a standard deviation (Gelman 2006).
 _TREND_SIZES = np.concatenate([[0.0], np.geomspace(1e-2, 30.0, 15)])
 _DEPARTURE_SIZES = np.concatenate([np.arange(0.0, 0.1, 0.01), np.arange(0.1, 0.5, 0.1)])
-#: Least probability, relative to the likeliest, at which a pair of sizes still counts.
+#: Likelihood, relative to the largest, below which a pair of sizes is neglected.
 _MIN_RELATIVE_LIKELIHOOD = 1e-3
-#: Fewest modes that a trend can be told from.
+#: Smallest number of modes for a trend.
 _MIN_MODES = 6
+#: Prior standard deviations of the Legendre coefficients 1 to 3, relative to the common gain.
+COEFFICIENT_SIGMA = (0.3, 0.15, 0.08)
 
 
 def smooth_over_modes(
     value: NDArray[np.float64], sigma: NDArray[np.float64], common_sigma: float = 0.0
 ) -> OpticalGains:
-    """Smooth gains over the order of the modes, as much as their errors ask for.
+    """Smooth gains over the modes, according to their standard errors.
 
-    ``g_m = trend(x_m) + departure_m + noise_m``: the trend a cubic smoothing spline in the modes'
-    spatial frequency, ``x = sqrt(m)`` for modes in the order of a Karhunen-Loeve basis, which is a
-    line plus an integrated Wiener process (Wahba 1983, J. R. Stat. Soc. B 45, 133); the departures
-    independent. How much the trend bends and how large the departures are is weighed by the
-    restricted likelihood, with the noise as stated by the standard errors.
+    The model is ``g_m = trend(x_m) + departure_m + noise_m``. The trend is a cubic smoothing spline in the
+    spatial frequency of the modes, ``x = sqrt(m)`` in the order of a Karhunen-Loeve basis, that is, a line
+    plus an integrated Wiener process (Wahba 1983, J. R. Stat. Soc. B 45, 133); the departures are
+    independent. The result is an average over the sizes of curvature and departures, weighted by the
+    restricted likelihood, with the noise given by the standard errors.
 
     Parameters
     ----------
     value, sigma
-        Gain of every mode and its standard error ``(n_modes,)``; infinite where it was not measured.
+        Gain of every mode and its standard error ``(n_modes,)``, infinite where it was not measured.
     common_sigma
-        Handed on.
+        Relative standard error common to all modes, copied to the result.
 
     Raises
     ------
     ValueError
-        No mode was measured, or an error is zero or negative.
+        No mode was measured, or a standard error is not positive.
     """
-    usable = np.isfinite(value) & np.isfinite(sigma)
-    if not usable.any() or not (sigma[usable] > 0).all():
+    is_measured = np.isfinite(value) & np.isfinite(sigma)
+    if not is_measured.any() or not (sigma[is_measured] > 0).all():
         raise ValueError("smoothing needs gains with positive standard errors, finite for one mode at least")
-    if np.count_nonzero(usable) < _MIN_MODES:
-        return _average_few_modes(value, sigma, usable, common_sigma)
+    if np.count_nonzero(is_measured) < _MIN_MODES:
+        return _average_few_modes(value, sigma, is_measured, common_sigma)
     x = np.sqrt(np.arange(value.size) + 1.0)
     x = (x - x[0]) / (x[-1] - x[0])
-    scale = abs(float(np.average(value[usable], weights=sigma[usable] ** -2.0)))
+    scale = abs(float(np.average(value[is_measured], weights=sigma[is_measured] ** -2.0)))
     wiener = _wiener_covariance(x) * scale**2
     fits = [
-        _KrigingFit.of(x, value, sigma, usable, wiener * trend_size**2, scale * departure_size)
+        _KrigingFit.from_gains(x, value, sigma, is_measured, wiener * trend_size**2, scale * departure_size)
         for trend_size in _TREND_SIZES
         for departure_size in _DEPARTURE_SIZES
     ]
     largest_log_likelihood = max(fit.log_likelihood for fit in fits)
     weighted_fits = [(np.exp(fit.log_likelihood - largest_log_likelihood), fit) for fit in fits]
     likely_fits = [(weight, fit) for weight, fit in weighted_fits if weight > _MIN_RELATIVE_LIKELIHOOD]
-    trend, trend_sigma = _model_average(
-        [(weight, fit.posterior(with_departures=False)) for weight, fit in likely_fits]
-    )
-    best, best_sigma = _model_average(
-        [(weight, fit.posterior(with_departures=True)) for weight, fit in likely_fits]
+    (trend, trend_sigma), (best, best_sigma) = (
+        _model_average([(weight, fit.posterior(with_departures=which)) for weight, fit in likely_fits])
+        for which in (False, True)
     )
     return OpticalGains(value, sigma, trend, trend_sigma, best, best_sigma, common_sigma)
 
 
-def usable(gains: OpticalGains) -> NDArray[np.float64]:
-    """Gains to scale by: one mode's noise must not turn its sign, nor raise its gain many times."""
+def clip_gains(gains: OpticalGains) -> NDArray[np.float64]:
+    """Gains to scale a matrix by, not below 0.3 times the median trend.
+
+    The noise of a mode must not change its sign or multiply its loop gain. Raises
+    :class:`CalibrationError` if the median trend is not positive.
+    """
     least = 0.3 * float(np.median(gains.trend))
     if not least > 0:
         raise CalibrationError(
@@ -119,7 +88,7 @@ def usable(gains: OpticalGains) -> NDArray[np.float64]:
 
 
 def _model_average(parts: list[tuple[float, ValuesAndErrors]]) -> ValuesAndErrors:
-    """Mean and standard error over weighted models, the models' disagreement in the error."""
+    """Mean and standard error over weighted models, including the scatter of the models."""
     weights = np.array([weight for weight, _ in parts])[:, None]
     means, errors = (np.stack([pair[k] for _, pair in parts]) for k in (0, 1))
     mean = (weights * means).sum(axis=0) / weights.sum()
@@ -128,13 +97,16 @@ def _model_average(parts: list[tuple[float, ValuesAndErrors]]) -> ValuesAndError
 
 
 def _average_few_modes(
-    value: NDArray[np.float64], sigma: NDArray[np.float64], usable: NDArray[np.bool_], common_sigma: float
+    value: NDArray[np.float64],
+    sigma: NDArray[np.float64],
+    is_measured: NDArray[np.bool_],
+    common_sigma: float,
 ) -> OpticalGains:
-    """Of too few modes: their mean as trend, and each mode's own value where it was measured."""
-    weights = sigma[usable] ** -2.0
-    trend = np.full(value.size, np.average(value[usable], weights=weights))
+    """For too few modes: the weighted mean as trend, and the value of each measured mode."""
+    weights = sigma[is_measured] ** -2.0
+    trend = np.full(value.size, np.average(value[is_measured], weights=weights))
     trend_sigma = np.full(value.size, weights.sum() ** -0.5)
-    best, best_sigma = np.where(usable, value, trend), np.where(usable, sigma, trend_sigma)
+    best, best_sigma = np.where(is_measured, value, trend), np.where(is_measured, sigma, trend_sigma)
     return OpticalGains(value, sigma, trend, trend_sigma, best, best_sigma, common_sigma)
 
 
@@ -146,12 +118,12 @@ def _wiener_covariance(x: NDArray[np.float64]) -> NDArray[np.float64]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _KrigingFit:
-    """A line without a prior and a process with one, given the measured gains (kriging with a drift)."""
+    """Kriging with a linear drift: a line without prior plus a Gaussian process."""
 
     drift_basis: NDArray[np.float64]
     kernel: NDArray[np.float64]
     departure_size: float
-    usable: NDArray[np.bool_]
+    is_measured: NDArray[np.bool_]
     factor: tuple[NDArray[np.float64], bool]
     normal: NDArray[np.float64]
     coefficients: NDArray[np.float64]
@@ -159,46 +131,60 @@ class _KrigingFit:
     log_likelihood: float
 
     @classmethod
-    def of(
+    def from_gains(
         cls,
         x: NDArray[np.float64],
         value: NDArray[np.float64],
         sigma: NDArray[np.float64],
-        usable: NDArray[np.bool_],
+        is_measured: NDArray[np.bool_],
         kernel: NDArray[np.float64],
         departure_size: float,
     ) -> _KrigingFit:
-        """The fit for a trend's covariance and departures of a size, with its restricted likelihood."""
+        """Fit for a covariance of the trend and a size of the departures, with its restricted likelihood."""
         drift_basis = np.stack([np.ones_like(x), x], axis=1)
-        line = drift_basis[usable]
+        line = drift_basis[is_measured]
         factor = cho_factor(
-            kernel[np.ix_(usable, usable)] + np.diag(sigma[usable] ** 2 + departure_size**2), lower=True
+            kernel[np.ix_(is_measured, is_measured)] + np.diag(sigma[is_measured] ** 2 + departure_size**2),
+            lower=True,
         )
         normal = line.T @ cho_solve(factor, line)
-        coefficients = np.linalg.solve(normal, line.T @ cho_solve(factor, value[usable]))
-        residual = value[usable] - line @ coefficients
+        coefficients = np.linalg.solve(normal, line.T @ cho_solve(factor, value[is_measured]))
+        residual = value[is_measured] - line @ coefficients
         log_likelihood = 2 * np.log(np.diag(factor[0])).sum() + np.linalg.slogdet(normal)[1]
         log_likelihood = -0.5 * float(log_likelihood + residual @ cho_solve(factor, residual))
         return cls(
-            drift_basis,
-            kernel,
-            departure_size,
-            usable,
-            factor,
-            normal,
-            coefficients,
-            residual,
+            drift_basis, kernel, departure_size, is_measured, factor, normal, coefficients, residual,
             log_likelihood,
-        )
+        )  # fmt: skip
 
     def posterior(self, *, with_departures: bool) -> ValuesAndErrors:
-        """Mean and standard error of the trend, or with ``with_departures`` of the gains themselves."""
-        prior = self.kernel + (self.departure_size**2 * np.eye(self.usable.size) if with_departures else 0.0)
-        cross_covariance = prior[:, self.usable]
+        """Mean and standard error of the trend, or of the gains ``with_departures``."""
+        prior = self.kernel + (
+            self.departure_size**2 * np.eye(self.is_measured.size) if with_departures else 0.0
+        )
+        cross_covariance = prior[:, self.is_measured]
         mean = self.drift_basis @ self.coefficients + cross_covariance @ cho_solve(self.factor, self.residual)
-        # What the line's own error adds, seen beside the process.
-        line = self.drift_basis[self.usable]
+        # Contribution of the error of the line, given the process.
+        line = self.drift_basis[self.is_measured]
         drift_residual = self.drift_basis - cross_covariance @ cho_solve(self.factor, line)
         covariance = prior - cross_covariance @ cho_solve(self.factor, cross_covariance.T)
         covariance += drift_residual @ np.linalg.solve(self.normal, drift_residual.T)
         return mean, np.sqrt(np.maximum(np.diag(covariance), 0))
+
+
+def gain_curve_basis(n_modes: int, coefficients: int = len(COEFFICIENT_SIGMA)) -> NDArray[np.float64]:
+    """Legendre curves over the modes, one prior standard deviation each ``(coefficients, n_modes)``.
+
+    The modes are in the order of a Karhunen-Loeve basis; there are at most as many curves as in
+    :data:`COEFFICIENT_SIGMA`.
+    """
+    x = np.sqrt(np.arange(1, n_modes + 1))
+    x = (2 * x - x[0] - x[-1]) / max(x[-1] - x[0], 1.0)
+    each = np.diag((0.0, *COEFFICIENT_SIGMA))[1 : coefficients + 1]
+    return np.stack([legendre.legval(x, one) for one in each]) if coefficients else np.zeros((0, n_modes))
+
+
+def compute_command_curves(m2c: NDArray[np.float64], basis: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+    """Change of a command due to each gain curve of a ``basis``, as matrices ``(n_act, n_act)``."""
+    to_modes = np.linalg.pinv(m2c)
+    return [(m2c * curve) @ to_modes for curve in basis]

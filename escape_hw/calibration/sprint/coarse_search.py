@@ -1,4 +1,4 @@
-"""From afar to within reach of the fine solver: few low modes first, then all, then many starts."""
+"""Coarse search for the registration: low modes first, then all modes, then a grid of starting points."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from escape_hw.api.synthetic_model import DifferentiableModel, SyntheticModel
 from escape_hw.calibration.sprint.least_squares import LeastSquaresFit, LeastSquaresProblem
 from escape_hw.calibration.sprint.weighted_matrix import WeightedMatrix
 
-#: Share of what noise leaves to explain that a registration must explain to be believed.
+#: Fraction of the signal that a registration must explain to be accepted.
 MIN_EXPLAINED_FRACTION = 0.8
-#: Modes of the coarse descent: the smoother they are, the farther it reaches.
+#: Modes of the coarse descent; smoother modes have a wider basin of convergence.
 N_COARSE_MODES = 5
-#: Starts of the last resort, in sub-apertures and degrees, and how many of the best are followed.
+#: Grid of starting points, in % of a sub-aperture and degrees, and number of the best to descend from.
 _SHIFTS = 150.0 * np.arange(-4, 5)
 _ROTATIONS = np.array([-10.0, -5.0, 0.0, 5.0, 10.0])
 _N_FOLLOWED = 4
-#: Iterations of each of these: what starts near its goal needs no more.
+#: Iterations of these descents.
 _FINE_ITERATIONS = 10
 
 
 def is_explained(problem: LeastSquaresProblem, fit: LeastSquaresFit) -> bool:
-    """Whether a fit explains what it should."""
+    """Whether a fit has a positive gain and explains the signal."""
     weighted = problem.weighted
     return (
         fit.gain > 0
@@ -43,34 +43,30 @@ def search_registration(
     learning_rate: float = 1.0,
     frozen: bool = False,
 ) -> Generator[LeastSquaresFit, None, LeastSquaresFit]:
-    """Descend to the registration of a matrix, from wherever it may be.
+    """Descend to the registration of a matrix from far away.
 
-    The basin of a mode is as wide as its features: five low modes converge from three actuator
-    pitches, forty from one. So the lowest of the columns go first and hand over to all of them. If
-    that does not explain the matrix, starts all over the field are compared; only for a model that
-    gives few modes quickly, for there are hundreds of them.
+    The basin of convergence of a mode is as wide as its features: five low modes converge from three
+    actuator pitches, forty from one. So the lowest columns are fitted first, then all of them. If the
+    result does not explain the matrix, hundreds of starting points are compared, for differentiable models
+    only, which compute few modes quickly. Slope weights are ignored.
 
     Parameters
     ----------
-    matrix, model
-        The measured matrix and the model that is to explain it.
-    columns
-        Which columns to use.
+    matrix, model, columns
+        The measured matrix, the model to fit, and the columns to use.
     start
-        Registration to start from ``(5,)``.
-    iterations
-        Iterations of each descent before giving up.
-    learning_rate
-        Share of each step that is taken.
+        Initial registration ``(5,)``.
+    iterations, learning_rate
+        Limit of the iterations of each descent, and fraction of each step that is taken.
     frozen
         Whether the descent on all columns keeps the derivatives of its start.
 
     Returns
     -------
-    LightFit
-        The best that was found, on all columns. Every step on the way is yielded.
+    LeastSquaresFit
+        The best fit of all columns. Every accepted step is yielded.
     """
-    fine = LeastSquaresProblem(WeightedMatrix.of(matrix, columns), model, learning_rate, frozen)
+    fine = LeastSquaresProblem(WeightedMatrix.from_columns(matrix, columns), model, learning_rate, frozen)
     coarse = low_mode_problem(matrix, model, columns, learning_rate) or fine
     best = yield from _coarse_to_fine(coarse, fine, start, iterations)
     if is_explained(fine, best) or not isinstance(model, DifferentiableModel):
@@ -87,11 +83,11 @@ def search_registration(
 def low_mode_problem(
     matrix: InteractionMatrix, model: SyntheticModel, columns: NDArray[np.intp], learning_rate: float = 1.0
 ) -> LeastSquaresProblem | None:
-    """The problem of the lowest of the columns; ``None`` where there are too few to leave some out."""
+    """The problem of the lowest columns; ``None`` if there are too few columns to omit some."""
     if columns.size <= 2 * N_COARSE_MODES:
         return None
     return LeastSquaresProblem(
-        WeightedMatrix.of(matrix, np.sort(columns)[:N_COARSE_MODES]), model, learning_rate
+        WeightedMatrix.from_columns(matrix, np.sort(columns)[:N_COARSE_MODES]), model, learning_rate
     )
 
 
@@ -104,7 +100,7 @@ def _coarse_to_fine(
 
 
 def _best_starts(problem: LeastSquaresProblem) -> list[NDArray[np.float64]]:
-    """The starts that explain most of the matrix as they are."""
-    places = [np.array([x, y, turn, 0.0, 0.0]) for x, y, turn in product(_SHIFTS, _SHIFTS, _ROTATIONS)]
-    explained_fraction = [problem.explained_fraction(grid_point) for grid_point in places]
-    return [places[k] for k in np.argsort(explained_fraction)[::-1][:_N_FOLLOWED]]
+    """The starting points of the grid that explain most of the matrix."""
+    grid = [np.array([x, y, turn, 0.0, 0.0]) for x, y, turn in product(_SHIFTS, _SHIFTS, _ROTATIONS)]
+    explained = [problem.explained_fraction(point) for point in grid]
+    return [grid[k] for k in np.argsort(explained)[::-1][:_N_FOLLOWED]]

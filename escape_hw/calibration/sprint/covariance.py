@@ -8,31 +8,32 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from escape_hw.api.synthetic_model import HasSystematicError, SyntheticModel
 from escape_hw.calibration.sprint.weighted_matrix import WeightedMatrix
 
-#: Singular values of the mirror's shapes below which slopes do not show them, of the largest.
+#: Singular values of the mirror's shapes, relative to the largest, below which the slopes do not show them.
 _MIN_SINGULAR_RATIO = 1e-3
-#: Slopes' worth of noise beyond the mirror's shapes, where a covariance has none.
+#: Least noise outside the mirror's shapes, in units of the variance of one slope.
 _MIN_LEVEL = 1e-3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LowRankNoise:
-    """Correlation of the slopes' noise as patterns on top of a level, and so its inverse.
+    """Correlation of the noise of the slopes: patterns on top of a uniform level, and its inverse.
 
-    What turbulence leaves after whitening is smooth over the pupil, so it looks like shapes of the mirror;
-    beyond them a level is enough. The principal shapes of the mirror stand for the noise's own: their
-    variances alone are told by few frames, where the inverse of a covariance of a thousand slopes takes
-    many thousand, and the noise's own principal patterns nearly as many.
+    The residual of whitened turbulence is smooth over the pupil, as the shapes of the mirror are, and a
+    uniform level is enough outside them. The principal shapes of the mirror stand for those of the noise:
+    a few frames determine their variances, whereas the inverse of the covariance of a thousand slopes, or
+    its own principal patterns, need many thousand frames.
 
     Parameters
     ----------
     level
-        Variance outside the patterns, of the slopes' own variances.
+        Variance outside the patterns, relative to the variances of the slopes.
     patterns
         Orthonormal ``(n_slopes, n_patterns)``.
     variances
-        Of the patterns ``(n_patterns,)``.
+        Variances of the patterns ``(n_patterns,)``.
     """
 
     level: float
@@ -40,16 +41,16 @@ class LowRankNoise:
     variances: NDArray[np.float64]
 
     @classmethod
-    def of(cls, covariance: NDArray[np.float64], zonal: NDArray[np.float64]) -> LowRankNoise:
-        """The patterns of a measured covariance.
+    def from_covariance(cls, covariance: NDArray[np.float64], zonal: NDArray[np.float64]) -> LowRankNoise:
+        """Project a measured covariance on the shapes of the mirror.
 
         Parameters
         ----------
         covariance
-            Of the slopes' noise ``(n_slopes, n_slopes)``, up to a factor, from any number of frames.
+            Covariance of the noise of the slopes ``(n_slopes, n_slopes)``, up to a factor, from any number
+            of frames.
         zonal
-            What the mirror can make: slopes per unit command ``(n_slopes, n_act)``, in units of the slopes'
-            noise.
+            Slopes per unit command ``(n_slopes, n_act)``, in units of the noise of the slopes.
         """
         standard_deviation = np.sqrt(np.diag(covariance))
         shapes, values, _ = np.linalg.svd(zonal, full_matrices=False)
@@ -57,7 +58,7 @@ class LowRankNoise:
         correlation = covariance / np.outer(standard_deviation, standard_deviation)
         variances = (shapes * (correlation @ shapes)).sum(axis=0)
         n_slopes, n_patterns = shapes.shape
-        # Each slope has a variance of 1.
+        # The trace of the correlation is n_slopes.
         level = max(n_slopes - float(variances.sum()), _MIN_LEVEL) / max(n_slopes - n_patterns, 1)
         return cls(level, shapes, np.maximum(variances, level))
 
@@ -67,30 +68,36 @@ class LowRankNoise:
         return np.asarray(np.eye(len(self.patterns)) / self.level + correction @ self.patterns.T)
 
 
-#: What the synthetic model gets wrong in common over the whole pupil, in the units of the parameters:
-#: rms over random plants on a twin with all imperfections, when noise no longer counts (docs/decisions).
+#: Systematic error of the registration due to errors of the synthetic model common to the whole pupil, in the
+#: units of the parameters: rms over the development realisations of a twin with all imperfections, at
+#: negligible noise (docs/decisions).
 MODEL_ERROR_FLOOR = np.array([0.03, 0.03, 0.0, 0.045, 0.018])
 
 
+def systematic_error(model: SyntheticModel) -> NDArray[np.float64]:
+    """Standard errors of the model's own registration ``(5,)``; 0 if it states none."""
+    return model.registration_systematic_error if isinstance(model, HasSystematicError) else np.zeros(5)
+
+
 class LinearisedProblem(Protocol):
-    """A least-squares problem about its solution."""
+    """A least-squares problem linearised at its solution."""
 
     @property
     def residual(self) -> NDArray[np.float64]:
-        """What is left ``(n_slopes, n_modes)``, in standard errors."""
+        """Data minus model ``(n_slopes, n_modes)``, in standard errors."""
         ...
 
     def information(self) -> NDArray[np.float64]:
-        """Information on gain, registration and whatever comes after them ``(n, n)``."""
+        """Information on gain, registration and the parameters after them ``(n, n)``."""
         ...
 
     def projected_jacobian(self) -> NDArray[np.float64]:
-        """Derivatives by the same parameters ``(n, n_slopes, n_modes)``, less what is not theirs."""
+        """Derivatives by the same parameters ``(n, n_slopes, n_modes)``, orthogonal to all others."""
         ...
 
 
 def _bartlett_windows(valid: NDArray[np.bool_]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """How near rows and columns are to each other: 1, falling to 0 at half the larger side of ``valid``."""
+    """Bartlett windows of the distances of rows and columns: 1, falling to 0 at half the larger side."""
     half_width = max(valid.shape) / 2
     rows, columns = (np.arange(n, dtype=float) for n in valid.shape)
     row_window, column_window = (
@@ -100,7 +107,7 @@ def _bartlett_windows(valid: NDArray[np.bool_]) -> tuple[NDArray[np.float64], ND
 
 
 def _sum_by_proximity(valid: NDArray[np.bool_], scores: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Sums of scores ``(n, n_valid)`` over sub-apertures by nearness; along rows, then along columns."""
+    """Windowed sums of scores ``(n, n_valid)`` around every sub-aperture."""
     row_window, column_window = _bartlett_windows(valid)
     maps = np.zeros((len(scores), *valid.shape))
     maps[:, valid] = scores
@@ -108,7 +115,7 @@ def _sum_by_proximity(valid: NDArray[np.bool_], scores: NDArray[np.float64]) -> 
 
 
 def _proximity(valid: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """How near valid sub-apertures are to each other ``(n_valid, n_valid)``, 1 in one place."""
+    """Window of every pair of valid sub-apertures ``(n_valid, n_valid)``."""
     row_window, column_window = _bartlett_windows(valid)
     rows, columns = np.nonzero(valid)
     return np.asarray(row_window[np.ix_(rows, rows)] * column_window[np.ix_(columns, columns)])
@@ -117,9 +124,9 @@ def _proximity(valid: NDArray[np.bool_]) -> NDArray[np.float64]:
 def _noise_score_covariance(
     scores: NDArray[np.float64], correlation: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Covariance of summed scores ``(n, n)`` that a correlation of the slopes' noise makes."""
-    standard_deviation = np.matmul(correlation, scores).reshape(len(scores), -1)
-    return np.asarray(scores.reshape(len(scores), -1) @ standard_deviation.T)
+    """Covariance of the summed scores ``(n, n)`` due to a correlation of the noise of the slopes."""
+    correlated = np.matmul(correlation, scores).reshape(len(scores), -1)
+    return np.asarray(scores.reshape(len(scores), -1) @ correlated.T)
 
 
 def _positive_part(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -131,48 +138,45 @@ def _positive_part(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
 def sandwich_covariance(
     weighted: WeightedMatrix, system: LinearisedProblem, noise: NDArray[np.float64] | None
 ) -> NDArray[np.float64]:
-    """Sandwich covariance of the common parameters, in units of their own.
+    """Sandwich covariance of the common parameters, in their units.
 
-    The middle is the covariance of the scores. What the noise makes of them is told by its own
-    covariance, where it is known: neighbouring sub-apertures err together. What the model misses has
-    its own pattern over the pupil and is in their scatter, so products of scores count with a weight that
-    falls linearly with the distance to zero at half the pupil (Bartlett's window, as in Newey & West 1987
-    over time), and only what they show beyond the noise is added: the scores of a solution sum to
-    nothing, so the window alone takes the noise for smaller than it is. Without a covariance the window is
-    all there is, and beyond it the scatter of the scores from mode to mode, which shows what moved all slopes
-    together while one mode was measured. What is common to the whole pupil no scatter can show; :data:`MODEL_ERROR_FLOOR`
-    stands for it.
+    The middle factor is the covariance of the scores. Its noise part follows from the covariance of the
+    noise, where that is known: turbulence correlates neighbouring sub-apertures. Its part due to the misfit
+    of the model is estimated from the scatter of the scores over the pupil: products of scores are weighted
+    with a Bartlett window that falls to zero at half the pupil (as in Newey & West 1987 over time), and
+    only their excess over the noise is added, because the scores at a solution sum to zero and the window
+    alone would underestimate the noise. Without a covariance of the noise the window is used for both, plus
+    the scatter of the scores from mode to mode, which contains errors common to all slopes during the
+    measurement of a mode. Errors common to the whole pupil appear in no scatter; :data:`MODEL_ERROR_FLOOR`
+    accounts for them.
 
     Parameters
     ----------
-    weighted
-        The measured matrix.
-    system
-        The problem about its solution.
+    weighted, system
+        The measured matrix, and the problem linearised at its solution.
     noise
-        Covariance of the slopes' noise ``(n_slopes, n_slopes)`` up to a factor, where it is known.
+        Covariance of the noise of the slopes ``(n_slopes, n_slopes)`` up to a factor, where it is known.
     """
     bread = np.linalg.inv(system.information())
     scores, valid = system.projected_jacobian(), weighted.valid
     element_scores = scores * system.residual
-    # Slopes along x and along y of one sub-aperture stand in one place.
-    by_place = element_scores.sum(axis=2).reshape(len(element_scores), 2, -1).sum(axis=1)
-    meat = by_place @ _sum_by_proximity(valid, by_place).T
-    power = weighted.noise(system.residual) ** 2
+    # The x and y slopes of a sub-aperture share its position.
+    by_sub_aperture = element_scores.sum(axis=2).reshape(len(element_scores), 2, -1).sum(axis=1)
+    meat = by_sub_aperture @ _sum_by_proximity(valid, by_sub_aperture).T
+    power = weighted.noise_level(system.residual) ** 2
     if noise is None:
         by_mode = element_scores.sum(axis=1)
         meat += by_mode @ by_mode.T
     else:
-        # A slope that never moved has no noise to share.
+        # A slope without variance is uncorrelated with all others.
         standard_deviation = np.where(np.diag(noise) > 0, np.sqrt(np.diag(noise)), np.inf)
         correlation = power * noise / np.outer(standard_deviation, standard_deviation)
         near_correlation = np.tile(_proximity(valid), (2, 2)) * correlation
-        # What the scatter shows beyond the noise is the model's.
         meat = _noise_score_covariance(scores, correlation) + _positive_part(
             meat - _noise_score_covariance(scores, near_correlation)
         )
     estimate = bread @ meat @ bread
-    # Never better than the noise alone allows.
+    # Not smaller than the errors due to noise alone.
     scale = np.sqrt(np.maximum(power * np.diag(bread) / np.diag(estimate), 1.0))
     covariance = estimate * np.outer(scale, scale)
     covariance[np.arange(1, 6), np.arange(1, 6)] += np.square(MODEL_ERROR_FLOOR)

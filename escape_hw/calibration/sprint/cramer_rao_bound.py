@@ -1,8 +1,8 @@
-"""The least error of a registration that frames of a DO-CRIME run allow: the Cramer-Rao bound.
+"""Hybrid Cramer-Rao bound of the registration for the frames of a DO-CRIME run.
 
-``docs/theory/sky-time.md`` derives it. Gain and registration are fixed unknowns; what a real mirror and
-sensor have besides are random effects with a known scatter, and the bound that counts both kinds is the
-*hybrid* one (Rockah & Schultheiss 1987).
+``docs/theory/sky-time.md`` derives it. Gain and registration are fixed unknowns; the differences between a
+real mirror and sensor and the model are random effects of known scatter, and the bound that includes both is
+the *hybrid* one (Rockah & Schultheiss 1987).
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from escape_hw.calibration.sprint.weighted_matrix import WeightedMatrix
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CramerRaoBound:
-    """Least standard errors of the registration ``(5,)``.
+    """Smallest possible standard errors of the registration ``(5,)``.
 
     Parameters
     ----------
     exact
-        For a model that is exact: gain and registration are the only unknowns.
+        For an exact model: gain and registration are the only unknowns.
     hybrid
-        With the random effects, and with what the model still misses.
+        With the random effects and the systematic error of the model.
     """
 
     exact: NDArray[np.float64]
@@ -47,23 +47,19 @@ def compute_registration_bound(
     registration: Registration,
     priors: Priors,
 ) -> CramerRaoBound:
-    """The bound for pokes that were really sent.
+    """Compute the bound for the pokes of a run.
 
     Parameters
     ----------
     matrix
-        A matrix of this sensor and basis; its data tell the gain.
+        A matrix of this sensor and basis; its data determine the gain.
     gram
-        Sum over the frames of whitened pokes times whitened pokes ``(n_modes, n_modes)``: of any rank.
+        Sum over the frames of products of whitened pokes ``(n_modes, n_modes)``, of any rank.
     covariance
-        Covariance of one frame's whitened noise ``(n_slopes, n_slopes)``, or its diagonal ``(n_slopes,)``
-        where more is not known.
-    model
-        The synthetic model on the same grid.
-    registration
-        Where to take the bound.
-    priors
-        Scatter of the random effects.
+        Covariance of one frame's whitened noise ``(n_slopes, n_slopes)``, or only its diagonal
+        ``(n_slopes,)``.
+    model, registration, priors
+        Synthetic model on the same sub-apertures, registration of the bound, scatter of the random effects.
     """
     variance = np.diag(covariance) if covariance.ndim == 2 else covariance
     unit = modal_matrix(model, registration, matrix.m2c)
@@ -71,12 +67,16 @@ def compute_registration_bound(
     truth = replace(matrix, data=(gain * unit).astype(np.float32))
     columns = decorrelate_columns(truth, gram, variance)
     if covariance.ndim == 2:
-        # What the slopes' noise has in common is counted as such.
+        # The correlation of the noise is included explicitly.
         priors = replace(priors, noise_inflation=1.0)
-    problem = MixedEffectsProblem(WeightedMatrix.of(columns, np.arange(columns.n_modes)), model, priors)
-    system = problem.linearise(problem.start(registration))
+    problem = MixedEffectsProblem(
+        WeightedMatrix.from_columns(columns, np.arange(columns.n_modes)), model, priors
+    )
+    system = problem.linearise(problem.initial_state(registration))
     if covariance.ndim == 2:
-        noise = LowRankNoise.of(covariance, problem.weighted.weigh(model.zonal_matrix(registration)))
+        noise = LowRankNoise.from_covariance(
+            covariance, problem.weighted.weigh(model.zonal_matrix(registration))
+        )
         information_matrix = correlated_information(system, problem.precision, noise.inverse())
         hybrid = np.linalg.inv(information_matrix)
     else:
@@ -88,34 +88,24 @@ def compute_registration_bound(
 
 
 def correlated_information(
-    system: NormalEquations, precision: NDArray[np.float64], inverse: NDArray[np.float64]
+    system: NormalEquations, precision: NDArray[np.float64], metric: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Information on all unknowns where neighbouring slopes err together.
+    """Information on all unknowns for correlated noise of the slopes.
 
-    As :func:`~.misfit.normal_equations` with ``J^T R^-1 J`` in place of ``J^T J``; the derivatives by
-    actuators and slopes are outer products here as well, and are never written out.
+    As :func:`~.normal_equations.normal_equations` with ``J^T R^-1 J`` in place of ``J^T J``; the derivatives
+    by actuators and slopes are outer products here as well and are not formed.
 
     Parameters
     ----------
     system
-        The linearised problem, weighted by the slopes' standard errors.
+        The linearised problem, weighted by the standard errors of the slopes.
     precision
-        Prior precision of every unknown.
-    inverse
-        Inverse of the correlation matrix of the slopes' noise ``(n_slopes, n_slopes)``.
-
-    Returns
-    -------
-    ndarray, ``(n, n)``
-        In the order of the unknowns.
+        Prior precision of every unknown ``(n,)``.
+    metric
+        Inverse of the correlation matrix of the noise of the slopes ``(n_slopes, n_slopes)``.
     """
-    common, sampling_derivative, model, modes = (
-        system.common,
-        system.sampling_derivative,
-        system.model,
-        system.modes,
-    )
-    metric, k = inverse, len(common)
+    common, sampling_derivative = system.common, system.sampling_derivative
+    model, modes, k = system.model, system.modes, len(system.common)
     member = (system.lines[:, None] == np.arange(system.lines.max() + 1)).astype(float)
     zonal = np.concatenate([system.gain_derivative, system.width_derivative], axis=1)
     modes_twice = np.concatenate([modes, modes])
@@ -133,7 +123,7 @@ def correlated_information(
     slope_line = (metric * (model @ sampling_derivative.T)) @ member
     acting = (zonal.T @ metric_zonal) * (modes_twice @ modes_twice.T)
     slope_slope = metric * (model @ model.T)
-    # A trend is a sum of slope gains.
+    # A trend is a linear combination of slope gains.
     trends, line_trend = system.trends, slope_line.T @ system.trends
     common_trend, slope_trend = by_slope @ trends, slope_slope @ trends
     trend_acting = trends.T @ slope_acting

@@ -1,4 +1,8 @@
-"""Diagnostics of a SPRINT fit: parameters that the data do not separate, and the orientation check (flips, transpose, quarter turns) of a matrix that no registration explains."""
+"""Diagnostics of a SPRINT fit.
+
+:func:`describe_degeneracies` names parameters that the data do not separate; :func:`check_orientation` tests
+flips, quarter turns and transposition for a matrix that no registration explains.
+"""
 
 from __future__ import annotations
 
@@ -14,9 +18,9 @@ from escape_hw.calibration.sprint.coarse_search import MIN_EXPLAINED_FRACTION, N
 from escape_hw.calibration.sprint.least_squares import LeastSquaresProblem
 from escape_hw.calibration.sprint.weighted_matrix import WeightedMatrix
 
-#: A parameter's error must grow by this factor, by not knowing the others, before anybody is told.
+#: Increase of the error of a parameter due to the other ones from which on a degeneracy is reported.
 _MIN_INFLATION = 5.0
-#: Share of a direction that a parameter must have to be named with it.
+#: Component of a direction that a parameter must have to be named with it.
 _MIN_COMPONENT = 0.3
 
 _LABELS = {
@@ -32,40 +36,33 @@ _LABELS = {
     "pupil_shift_x": "pupil shift x",
     "pupil_shift_y": "pupil shift y",
 }
-#: What stands behind the usual ones.
+#: Reasons of the common degeneracies.
 _REASONS = (
-    ({"gain", "radial scaling", "tangential scaling"}, "a larger mirror has flatter slopes, as a weaker one"),
-    ({"gain", "width of the influence functions"}, "wider influence functions have flatter slopes"),
-    ({"gain", "pedestal of the influence functions"}, "a pedestal looks like a smaller gain on high modes"),
+    ({"gain", "radial scaling", "tangential scaling"}, "a larger mirror has smaller slopes, as a weaker one"),
+    ({"gain", "width of the influence functions"}, "wider influence functions have smaller slopes"),
+    ({"gain", "pedestal of the influence functions"}, "a pedestal acts as a smaller gain of high modes"),
     (
         {"width of the influence functions", "pedestal of the influence functions"},
         "a pedestal widens an influence function",
     ),
     (
         {"radial scaling", "tangential scaling", "width of the influence functions"},
-        "scalings stretch the influence functions, too",
+        "scalings also stretch the influence functions",
     ),
-    ({"shift x", "shift y", "rotation"}, "lit on one side only, a turn looks like a shift"),
+    ({"shift x", "shift y", "rotation"}, "with light on one side only, a rotation acts as a shift"),
     (
         {"shift x", "shift y", "pupil shift x", "pupil shift y"},
-        "the mirror moves with the pupil's images, and only their rims say which of them it was",
+        "the mirror moves with the pupil images, and only their rims separate the two",
     ),
-    ({"rotation", "anamorphosis"}, "lit along one axis only, a shear looks like a turn"),
+    ({"rotation", "anamorphosis"}, "with light along one axis only, a shear acts as a rotation"),
 )  # fmt: skip
 
 
 def describe_degeneracies(covariance: NDArray[np.float64], names: Sequence[str]) -> tuple[str, ...]:
-    """Sentences on the directions along which the errors of several parameters go together.
+    """Describe groups of parameters with strongly correlated errors, from their covariance ``(n, n)``.
 
-    The eigenvectors of the correlation matrix with the smallest eigenvalues are the combinations that are
-    known much better than their members are: each member alone is uncertain because the others are.
-
-    Parameters
-    ----------
-    covariance
-        Of the parameters ``(n, n)``, or of their first ones.
-    names
-        What they are called ``(n,)``.
+    The eigenvectors of the correlation matrix with the smallest eigenvalues are combinations of parameters
+    that are determined much better than each parameter alone.
     """
     sigma = np.sqrt(np.diag(covariance))
     if not (np.isfinite(sigma).all() and (sigma > 0).all()):
@@ -83,17 +80,13 @@ def describe_degeneracies(covariance: NDArray[np.float64], names: Sequence[str])
         members = [_LABELS.get(names[k], names[k]) for k in members_at]
         reason = next((f" ({why})" for which, why in _REASONS if set(members) <= which), "")
         notes.append(
-            f"{_join_words(members)} can hardly be told apart{reason}: each would be known "
+            f"{', '.join(members[:-1])} and {members[-1]} are hardly separable{reason}: each would be known "
             f"{inflation:.0f} times better if the others were known"
         )
     return tuple(notes)
 
 
-def _join_words(words: Sequence[str]) -> str:
-    return f"{', '.join(words[:-1])} and {words[-1]}"
-
-
-#: How the sensor would see the pupil, and the map of (row, column) offsets from the middle.
+#: Orientation of the pupil on the sensor, and the map of (row, column) offsets from its centre.
 _ORIENTATIONS = {
     "mirrored left to right": ((1, 0), (0, -1)),
     "upside down": ((-1, 0), (0, 1)),
@@ -109,21 +102,17 @@ _ITERATIONS = 10
 def check_orientation(
     matrix: InteractionMatrix, model: SyntheticModel, columns: NDArray[np.intp]
 ) -> str | None:
-    """What would explain a matrix that no registration explains.
-
-    Parameters
-    ----------
-    matrix, model, columns
-        As for SPRINT.
+    """Find a flip, quarter turn or transposition with which the model explains a matrix.
 
     Returns
     -------
     str or None
-        A sentence for the operator; ``None`` if nothing helps, or if the model is too slow to try.
+        A hint for the operator; ``None`` if no orientation explains the matrix, or if the model is not
+        differentiable and so too slow.
     """
     if not isinstance(model, DifferentiableModel):
         return None
-    weighted = WeightedMatrix.of(matrix, np.sort(columns)[:N_COARSE_MODES])
+    weighted = WeightedMatrix.from_columns(matrix, np.sort(columns)[:N_COARSE_MODES])
     for orientation, reoriented in _reoriented(weighted):
         problem = LeastSquaresProblem(reoriented, model)
         *_, fit = problem.descend(np.zeros(5), _ITERATIONS)
@@ -134,7 +123,7 @@ def check_orientation(
 
 
 def _reoriented(weighted: WeightedMatrix) -> Iterator[tuple[str, WeightedMatrix]]:
-    """The matrix as a sensor turned or flipped would have seen it; slopes it would not have are left out."""
+    """The matrix as seen by a sensor in each orientation; slopes that it would not have get no weight."""
     valid = weighted.valid
     number = np.full(valid.shape, -1)
     number[valid] = np.arange(int(valid.sum()))
@@ -148,7 +137,7 @@ def _reoriented(weighted: WeightedMatrix) -> Iterator[tuple[str, WeightedMatrix]
         target = np.rint((positions - middle) @ rotation.T + middle).astype(int)
         source = number[target[:, 0], target[:, 1]]
         data, noise = np.zeros_like(weighted.data), np.full(2 * n, np.inf)
-        # Slopes are vectors (x, y) against offsets (row, column): they turn as the offsets do.
+        # Slopes (x, y) transform as the offsets (row, column) do.
         for half, axis in ((0, 1), (1, 0)):
             along = int(np.flatnonzero(rotation.T[axis])[0])
             from_half = 1 - along

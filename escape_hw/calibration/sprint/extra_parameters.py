@@ -1,9 +1,9 @@
-"""What SPRINT may fit beside the five parameters of the paper, where the data carry it.
+"""Extra parameters that SPRINT can fit beside the five of the paper.
 
-Each is a change of the model by a number with a wide prior, fitted as a variant of the model is. A
-mirror seen askew is not only scaled along x and y but sheared: the scalings along the diagonals differ
-(*anamorphosis*). And the images of a pyramid may have moved since they were found (*pupil shift*): the
-mirror then seems to have moved with them, and only the rims tell the two apart.
+Each is a change of the model by a number with a wide prior, fitted as a variant of the model is. The oblique
+image of a mirror is sheared as well as scaled along x and y: the scalings along the diagonals differ
+(*anamorphosis*). And the images of a pyramid may have moved since they were located (*pupil shift*): the
+mirror then appears to have moved with them, and only the rims separate the two.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from escape_hw.api.synthetic_model import HasPupilShift, SyntheticModel
 from escape_hw.config.choices import ExtraParameter
 from escape_hw.errors import ConfigError
 
-#: Prior scatter: the shear in % of the diameter, and the images' shift in % of a sub-aperture.
+#: Prior standard deviations: shear in % of the diameter, shift of the images in % of a sub-aperture.
 _SHEAR_SIGMA, _PUPIL_SHIFT_SIGMA = 2.0, 20.0
-#: Shares of the prior scatter below which a difference is taken about zero.
+#: Value, in prior standard deviations, below which a symmetric difference about zero is used.
 _SMALL_VALUE = 0.01
 
 
@@ -32,11 +32,9 @@ class Anamorphosis:
 
     Parameters
     ----------
-    model
-        Gives matrices under any registration.
-    name, unit
-        What it is called, and what it is measured in.
-    scatter
+    model, name, unit
+        The synthetic model, name and unit of the parameter.
+    prior_sigma
         Prior standard deviation about zero, in that unit.
     """
 
@@ -46,20 +44,20 @@ class Anamorphosis:
     prior_sigma: float = _SHEAR_SIGMA
 
     def systematic_error(self, registration_systematic_error: NDArray[np.float64]) -> float:
-        """What the model's own error adds: as much as to the scalings, of which a shear is one."""
+        """Systematic error: that of the scalings, of which the shear is one."""
         return float(registration_systematic_error[3:].max())
 
     def matrix_change(
         self, registration: Registration, width: float, scaled_value: float
     ) -> NDArray[np.float64]:
-        """Change of the zonal matrix ``(n_slopes, n_act)`` per prior scatter.
+        """Change of the zonal matrix ``(n_slopes, n_act)`` per prior standard deviation.
 
         Parameters
         ----------
         registration, width
             As for :meth:`~escape_hw.api.synthetic_model.SyntheticModel.zonal_matrix`.
-        share
-            Present value in prior scatters; times this the change is exact.
+        scaled_value
+            Present value in prior standard deviations; multiplied with it the change is exact.
         """
 
         def at(value: float) -> NDArray[np.float64]:
@@ -72,13 +70,13 @@ class Anamorphosis:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PupilShift:
-    """Shift of all pupil images from where they were found, along one axis, in % of a sub-aperture.
+    """Shift of all pupil images since they were located, along one axis, in % of a sub-aperture.
 
     Parameters
     ----------
     model, moved
-        With the images where they were found, and one prior scatter further along the axis.
-    name, unit, scatter
+        The model with the images as located, and shifted by one prior standard deviation along the axis.
+    name, unit, prior_sigma
         As for :class:`Anamorphosis`.
     """
 
@@ -89,13 +87,13 @@ class PupilShift:
     prior_sigma: float = _PUPIL_SHIFT_SIGMA
 
     def systematic_error(self, registration_systematic_error: NDArray[np.float64]) -> float:
-        """Nothing: a registration is in doubt because the images are, whose shift is told here."""
+        """Zero: the systematic error of the registration is that of the images, whose shift is fitted."""
         return 0.0
 
     def matrix_change(
         self, registration: Registration, width: float, scaled_value: float
     ) -> NDArray[np.float64]:
-        """As for :class:`Anamorphosis`, to first order: images are not made anew for every share."""
+        """As for :class:`Anamorphosis`, to first order."""
         unshifted = self.model.zonal_matrix(registration, width)
         return np.asarray(self.moved.zonal_matrix(registration, width) - unshifted)
 
@@ -106,65 +104,49 @@ ExtraParameterModel = Anamorphosis | PupilShift
 
 @dataclass(frozen=True, slots=True)
 class FittedExtraParameter:
-    """An extra unknown as it was found.
+    """An extra parameter with its fitted value.
 
     Parameters
     ----------
-    unknown
-        Which.
-    place
-        Its place among all unknowns of the fit.
-    share
-        Its value in prior scatters.
+    model
+        The parameter.
+    index
+        Its index among all unknowns of the fit.
+    scaled_value
+        Its value in prior standard deviations.
     """
 
-    unknown: ExtraParameterModel
+    model: ExtraParameterModel
     index: int
     scaled_value: float
 
     def to_estimate(
         self, sigma: NDArray[np.float64], registration_systematic_error: NDArray[np.float64]
     ) -> Estimate:
-        """With its standard error, from those of all unknowns and the model's own of the registration."""
-        unknown = self.unknown
-        earlier = float(sigma[self.index]) * unknown.prior_sigma
+        """Value and standard error, from those of all unknowns and the systematic ones ``(5,)``."""
+        statistical = float(sigma[self.index]) * self.model.prior_sigma
         return Estimate(
-            self.scaled_value * unknown.prior_sigma,
-            float(np.hypot(earlier, unknown.systematic_error(registration_systematic_error))),
-            unknown.unit,
+            self.scaled_value * self.model.prior_sigma,
+            float(np.hypot(statistical, self.model.systematic_error(registration_systematic_error))),
+            self.model.unit,
         )
 
 
-def option_name_of(name: str) -> ExtraParameter:
-    """What an unknown is asked for with: ``"pupil_shift"`` for one along x or along y."""
-    return "pupil_shift" if name.startswith("pupil_shift") else "anamorphosis"
-
-
 def build_extra_parameters(
-    model: SyntheticModel, also: Sequence[ExtraParameter]
+    model: SyntheticModel, names: Sequence[ExtraParameter]
 ) -> tuple[ExtraParameterModel, ...]:
-    """The unknowns that go by some names.
+    """Extra parameters by their names in the configuration; ``"pupil_shift"`` is one along x and one along y.
 
-    Parameters
-    ----------
-    model
-        The synthetic model.
-    also
-        ``"anamorphosis"``, ``"pupil_shift"`` (one along x and one along y).
-
-    Raises
-    ------
-    ConfigError
-        The model has no images that could be shifted.
+    Raises :class:`ConfigError` if the model has no pupil images that could be shifted.
     """
     parameters: list[ExtraParameterModel] = []
-    if "anamorphosis" in also:
+    if "anamorphosis" in names:
         parameters.append(Anamorphosis(model))
-    if "pupil_shift" in also:
+    if "pupil_shift" in names:
         if not isinstance(model, HasPupilShift):
             raise ConfigError(
-                f"calibration.extra_parameters: the model '{model.name}' of this sensor knows no shift of the pupil; "
-                "it is for a pyramid and calibration.model = 'fast'"
+                f"calibration.extra_parameters: the model '{model.name}' of this sensor has no shift of the "
+                "pupil; it is for a pyramid and calibration.model = 'fast'"
             )
         parameters.append(PupilShift(model, model.with_pupil_shift(_PUPIL_SHIFT_SIGMA, 0.0), "pupil_shift_x"))
         parameters.append(PupilShift(model, model.with_pupil_shift(0.0, _PUPIL_SHIFT_SIGMA), "pupil_shift_y"))
@@ -174,23 +156,21 @@ def build_extra_parameters(
 def build_fitted_extra_parameters(
     model: SyntheticModel, earlier: Iterable[str]
 ) -> tuple[ExtraParameterModel, ...]:
-    """The unknowns that an earlier fit has told of, by their names; raises as :func:`build_extra_parameters`."""
-    return build_extra_parameters(model, tuple(dict.fromkeys(map(option_name_of, earlier))))
+    """The parameters of an earlier fit, by the names of its estimates."""
+    names: dict[ExtraParameter, None] = {}
+    for name in earlier:
+        names["pupil_shift" if name.startswith("pupil_shift") else "anamorphosis"] = None
+    return build_extra_parameters(model, tuple(names))
 
 
 def priors_from_fit(
-    unknowns: Sequence[ExtraParameterModel], earlier: Mapping[str, Estimate]
+    parameters: Sequence[ExtraParameterModel], earlier: Mapping[str, Estimate]
 ) -> tuple[tuple[float, float], ...]:
-    """Mean and scatter of each unknown in its own prior scatters, as an earlier fit has told them.
+    """Prior mean and standard deviation of each parameter from earlier estimates, in default ones.
 
-    Parameters
-    ----------
-    unknowns
-        Which.
-    told
-        The earlier fit's values by name. What it told nothing of keeps its wide prior about zero.
+    A parameter without an earlier estimate keeps its default prior.
     """
-    known = [(earlier.get(one.name), one.prior_sigma) for one in unknowns]
+    known = [(earlier.get(one.name), one.prior_sigma) for one in parameters]
     return tuple(
         (0.0, 1.0) if fit is None else (fit.value / wide, min(1.0, max(fit.sigma / wide, _SMALL_VALUE)))
         for fit, wide in known

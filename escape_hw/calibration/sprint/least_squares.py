@@ -1,4 +1,8 @@
-"""Registration-only least-squares solvers of SPRINT: damped Gauss-Newton for one gain and five parameters (paper, Eq. argmin_simple), the same in batches of a few modes, and with one gain per mode (Eq. argmin_full)."""
+"""Registration-only least-squares solvers of SPRINT.
+
+Damped Gauss-Newton for one gain and five parameters (paper, Eq. argmin_simple), the same in batches of a few
+modes, and with one gain per mode (Eq. argmin_full).
+"""
 
 from __future__ import annotations
 
@@ -13,36 +17,34 @@ from escape_hw.api.synthetic_model import SyntheticModel
 from escape_hw.calibration.modes.derivatives import modal_jacobian, modal_matrix
 from escape_hw.calibration.sprint.weighted_matrix import WeightedMatrix
 
-#: Largest move in one iteration, in the units of the parameters: the model is only locally linear.
+#: Largest step of an iteration, in the units of the parameters: the model is only locally linear.
 MAX_STEP = np.array([120.0, 120.0, 4.0, 8.0, 8.0])
-#: A step below this, or below a fiftieth of the standard error, ends the descent.
+#: A step below this, or below a fiftieth of the standard errors, ends the descent.
 NEGLIGIBLE_STEP = np.array([5e-3, 5e-3, 2e-4, 2e-3, 2e-3])
-#: A step below this share of the largest leaves the derivatives as they were.
+#: The derivatives are kept after a step below this fraction of the largest one.
 _REUSE_JACOBIAN_BELOW = 0.1
-#: Levenberg's damping after a step that made things worse, and where to give up.
+#: Levenberg damping after a step that increased the cost, and the damping at which the descent gives up.
 _FIRST_DAMPING, _MAX_DAMPING = 1e-2, 1e4
 
 
 @dataclass(slots=True, eq=False)
 class LeastSquaresFit:
-    """Gain and registration at some point of the descent.
+    """Gain and registration at one iteration.
 
     Parameters
     ----------
-    alpha
-        The registration ``(5,)``.
-    gain
-        The gain that fits best there.
-    unit
+    alpha, gain
+        The registration ``(5,)``, and the best gain there.
+    model_matrix
         The model's matrix at gain 1 ``(n_slopes, n_modes)``, in standard errors.
     derivatives
-        Its derivatives by the registration ``(5, n_slopes, n_modes)``, at this place or near it.
+        Its derivatives by the registration ``(5, n_slopes, n_modes)``, here or at a nearby registration.
     residual
-        What is left ``(n_slopes, n_modes)``, in standard errors.
+        Data minus model ``(n_slopes, n_modes)``, in standard errors.
     step
         The last step ``(5,)``; zero at the start.
-    settled
-        Whether the next step would be too small to matter.
+    steps_converged
+        Whether the next step would be negligible.
     """
 
     alpha: NDArray[np.float64]
@@ -69,19 +71,11 @@ class LeastSquaresFit:
 
 
 class LeastSquaresProblem:
-    """A weighted matrix and the model that is to explain it.
+    """Fit of gain and registration to a weighted matrix.
 
-    Parameters
-    ----------
-    weighted
-        The measured matrix.
-    model
-        The synthetic model.
-    learning_rate
-        Share of each step that is taken, in (0, 1] (paper: gamma).
-    frozen
-        Whether the derivatives stay those of the start, as in the first publications: an iteration then
-        costs a matrix instead of a matrix and its derivatives, and there are more of them.
+    The learning rate (paper: gamma) is the fraction of each step that is taken, in (0, 1]. With ``frozen``
+    the derivatives of the start are kept, as in the first publications: an iteration then computes a matrix
+    without its derivatives, but more iterations are needed.
     """
 
     def __init__(
@@ -107,7 +101,7 @@ class LeastSquaresProblem:
         return self._fit(alpha, model_matrix, derivatives[:5], step)
 
     def explained_fraction(self, alpha: NDArray[np.float64]) -> float:
-        """Share of the squared elements that the model explains at its best gain."""
+        """Fraction of the sum of squares that the model explains at its best gain."""
         model_matrix = self.matrix(alpha)
         return self.weighted.explained_fraction(
             self.weighted.data - self._best_gain(model_matrix) * model_matrix
@@ -137,7 +131,7 @@ class LeastSquaresProblem:
         return fit
 
     def step(self, fit: LeastSquaresFit, damping: float) -> NDArray[np.float64] | None:
-        """Damped Gauss-Newton step of the registration; also tells the fit whether it has settled."""
+        """Damped Gauss-Newton step, ``None`` if singular; sets ``fit.steps_converged``."""
         information = fit.information()
         right = fit.projected_jacobian().reshape(6, -1) @ fit.residual.ravel()
         try:
@@ -147,8 +141,8 @@ class LeastSquaresProblem:
             return None
         if not np.isfinite(step).all():
             return None
-        spread *= self.weighted.noise(fit.residual)
-        fit.steps_converged = bool((np.abs(step) < np.maximum(NEGLIGIBLE_STEP, 0.02 * spread)).all())
+        spread *= self.weighted.noise_level(fit.residual)
+        fit.steps_converged = _is_negligible(step, spread)
         return np.asarray(step)
 
     def _best_gain(self, model_matrix: NDArray[np.float64]) -> float:
@@ -175,17 +169,10 @@ BATCH_SIZE = 5
 
 
 class BatchProblem:
-    """A weighted matrix that is looked at a few modes at a time.
+    """Fit of gain and registration to batches of a few modes, one after the other.
 
-    Parameters
-    ----------
-    weighted
-        The measured matrix.
-    model
-        The synthetic model.
-    learning_rate
-        Share of each step that is taken (paper: gamma). At 1 every batch forgets what those before it
-        found, and the answer is that of the last; the less, the more batches it averages over.
+    At a learning rate of 1 the result is that of the last batch alone; the smaller the rate, the more batches
+    it averages over.
     """
 
     def __init__(self, weighted: WeightedMatrix, model: SyntheticModel, learning_rate: float) -> None:
@@ -203,11 +190,12 @@ class BatchProblem:
 
         Returns
         -------
-        fit : LightFit
-            On all modes, where the last batch led to; settled when a whole round led nowhere new.
-        scatter : ndarray, ``(5, 5)``
-            Covariance of the answer by the scatter of the batches' own answers in the last round: the
-            stationary variance of a walk that moves by ``gamma`` times what is missing, ``gamma /
+        fit : LeastSquaresFit
+            Of all modes, at the registration after the last batch; converged if the last pass through all
+            batches changed it negligibly.
+        covariance : ndarray, ``(5, 5)``
+            Covariance of the registration from the scatter of the batches' own solutions in the last pass:
+            a walk by ``gamma`` times the distance to each solution has the stationary variance ``gamma /
             (2 - gamma)`` of theirs.
         """
         alpha, steps_converged = start, False
@@ -221,13 +209,13 @@ class BatchProblem:
                     batch_solutions[number] = alpha
                     continue
                 batch_solutions[number] = alpha + full_step
-                step = self._learning_rate * full_step / max(1.0, float(np.max(np.abs(full_step) / MAX_STEP)))
+                step = _limit_step(full_step, self._learning_rate)
                 fit.step = step
                 yield fit
                 alpha = alpha + step
             spread = np.sqrt(np.diag(self._batch_covariance(batch_solutions)))
-            if (np.abs(alpha - round_start) < np.maximum(NEGLIGIBLE_STEP, 0.02 * spread)).all():
-                steps_converged = True
+            steps_converged = _is_negligible(alpha - round_start, spread)
+            if steps_converged:
                 break
         last = self._all_modes.linearise(alpha, np.zeros(5))
         last.steps_converged = steps_converged
@@ -240,17 +228,7 @@ class BatchProblem:
 
 
 class DiagonalProblem:
-    """A weighted matrix whose modes have gains of their own.
-
-    Parameters
-    ----------
-    weighted
-        The measured matrix.
-    model
-        The synthetic model.
-    learning_rate
-        Share of each step of the registration that is taken.
-    """
+    """Fit of the registration and one gain per mode, in alternation."""
 
     def __init__(self, weighted: WeightedMatrix, model: SyntheticModel, learning_rate: float) -> None:
         self.weighted, self._model, self._learning_rate = weighted, model, learning_rate
@@ -259,10 +237,10 @@ class DiagonalProblem:
     def descend(
         self, start: NDArray[np.float64], iterations: int
     ) -> Generator[LeastSquaresFit, None, LeastSquaresFit]:
-        """Yield every state from a start on; return the last.
+        """Yield the fit of every iteration; return the last.
 
-        Its gain is the mean gain, and its derivatives are those that no mode's gain can imitate, so
-        that information and errors count the gains as unknown.
+        Its gain is the mean of the gains, and its derivatives are orthogonal to them, so that the
+        information counts the gains as unknown.
         """
         alpha, step = start, np.zeros(5)
         for _ in range(iterations + 1):
@@ -273,47 +251,40 @@ class DiagonalProblem:
             gains = (model_matrix * self.weighted.data).sum(axis=0) / power
             registration_jacobian = gains * derivatives[:5]
             residual = self.weighted.data - gains * model_matrix
-            fit = _build_fit(alpha, gains, model_matrix, registration_jacobian, power, residual, step)
+            mean = float(np.average(gains, weights=power))
+            overlap = (registration_jacobian * model_matrix).sum(axis=1) / power
+            projected = registration_jacobian - model_matrix * overlap[:, None]
+            fit = LeastSquaresFit(alpha, mean, model_matrix, projected / (mean or 1.0), residual, step)
             full_step = _solve_step(registration_jacobian, residual)
             if full_step is None:
                 return fit
             spread = np.sqrt(np.abs(np.diag(np.linalg.pinv(fit.information()))))[1:]
-            spread *= self.weighted.noise(residual)
-            fit.steps_converged = bool((np.abs(full_step) < np.maximum(NEGLIGIBLE_STEP, 0.02 * spread)).all())
+            spread *= self.weighted.noise_level(residual)
+            fit.steps_converged = _is_negligible(full_step, spread)
             yield fit
             if fit.steps_converged:
                 break
-            step = self._learning_rate * full_step / max(1.0, float(np.max(np.abs(full_step) / MAX_STEP)))
+            step = _limit_step(full_step, self._learning_rate)
             alpha = alpha + step
         return fit
+
+
+def _is_negligible(step: NDArray[np.floating], sigma: NDArray[np.float64]) -> bool:
+    return bool((np.abs(step) < np.maximum(NEGLIGIBLE_STEP, 0.02 * sigma)).all())
+
+
+def _limit_step(step: NDArray[np.float64], learning_rate: float) -> NDArray[np.float64]:
+    """The fraction of a step that is taken, no longer than :data:`MAX_STEP`."""
+    return learning_rate * step / max(1.0, float(np.max(np.abs(step) / MAX_STEP)))
 
 
 def _solve_step(
     derivatives: NDArray[np.float64], residual: NDArray[np.float64]
 ) -> NDArray[np.float64] | None:
-    """The step that these derivatives ``(5, ...)`` ask for; ``None`` where they tell nothing."""
+    """Gauss-Newton step for derivatives ``(5, ...)``; ``None`` if they are singular."""
     flat = derivatives.reshape(5, -1)
     try:
         step = np.linalg.solve(flat @ flat.T, flat @ residual.ravel())
     except np.linalg.LinAlgError:
         return None
     return np.asarray(step) if np.isfinite(step).all() else None
-
-
-def _build_fit(
-    alpha: NDArray[np.float64],
-    gains: NDArray[np.float64],
-    model_matrix: NDArray[np.float64],
-    registration_jacobian: NDArray[np.float64],
-    power: NDArray[np.float64],
-    residual: NDArray[np.float64],
-    step: NDArray[np.float64],
-) -> LeastSquaresFit:
-    """As a fit with one gain, the mean of all by what they explain."""
-    mean = float(np.average(gains, weights=power))
-    projected = (
-        registration_jacobian
-        - model_matrix * ((registration_jacobian * model_matrix).sum(axis=1) / power)[:, None]
-    )
-    scale = mean if mean else 1.0
-    return LeastSquaresFit(alpha, mean, model_matrix, projected / scale, residual, step)

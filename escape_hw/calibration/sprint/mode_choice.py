@@ -1,4 +1,4 @@
-"""Which modes SPRINT looks at: by their signal, by their order, or by what they tell of the registration."""
+"""Choice of the modes that SPRINT fits: by signal-to-noise ratio, by order, or by Fisher information."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from escape_hw.calibration.sprint.least_squares import MAX_STEP, LeastSquaresPro
 from escape_hw.calibration.sprint.weighted_matrix import WeightedMatrix
 from escape_hw.config.choices import ModesChoice
 
-#: Information that every parameter is given to begin with, relative to that of all modes together: the
-#: first mode alone cannot tell all of them apart.
+#: Initial information on every parameter, relative to that of all modes: a single mode does not determine
+#: all parameters.
 _PRIOR_INFORMATION = 1e-6
 
 
@@ -24,26 +24,25 @@ def choose_modes(
     model: SyntheticModel | None = None,
     start: Registration | None = None,
 ) -> NDArray[np.intp]:
-    """The ``n_modes`` modes to fit, in their own order.
+    """Choose the modes to fit; in ascending order.
 
     Parameters
     ----------
-    matrix
-        The measured matrix with its standard errors.
-    n_modes
-        How many.
-    choice
+    matrix, n_modes
+        The measured matrix with its standard errors, and number of modes to choose.
+    modes_choice
         ``"first"``: the first ones. ``"snr"``: those with the highest signal-to-noise ratio; on open-loop
-        data these are not the first, which carry the turbulence. ``"d-optimal"``: those that together make
-        the volume of the registration's error ellipsoid smallest, ``"a-optimal"``: the sum of its variances
-        in units of the longest step (:func:`choose_by_fisher_information`).
+        data these are not the first, which contain most of the turbulence. ``"d-optimal"``: those that
+        minimise the volume of the error ellipsoid of the registration; ``"a-optimal"``: the sum of its
+        variances in units of the largest step (:func:`choose_by_fisher_information`).
     model, start
-        The synthetic model, and where to take its derivatives (zero by default); for the last two.
+        The synthetic model, and the registration at which it is differentiated (zero by default); for the
+        last two.
 
     Raises
     ------
     ValueError
-        A choice by information without a model.
+        A choice by Fisher information without a model.
     """
     if modes_choice == "first":
         return np.arange(n_modes)
@@ -52,7 +51,7 @@ def choose_modes(
         best = np.argsort(np.where(np.isfinite(snr), -snr, -np.inf), kind="stable")[:n_modes]
         return np.sort(best)
     if model is None:
-        raise ValueError(f"modes are chosen '{modes_choice}' by their derivatives; hand over the model")
+        raise ValueError(f"modes_choice = '{modes_choice}' needs the derivatives of the model; pass model=")
     by_mode = mode_information(matrix, model, start or Registration())
     return choose_by_fisher_information(by_mode, n_modes, modes_choice)
 
@@ -62,10 +61,10 @@ def mode_information(
 ) -> NDArray[np.float64]:
     """Fisher information of every mode on gain and registration ``(n_modes, 6, 6)``.
 
-    With white noise the modes' information adds: ``F = sum_m J_m^T J_m``, ``J_m (n_slopes, 6)`` the
-    derivatives of a column by the parameters, in standard errors.
+    For white noise the information of the modes adds: ``F = sum_m J_m^T J_m``, with ``J_m (n_slopes, 6)``
+    the derivatives of a column by the parameters, in standard errors.
     """
-    problem = LeastSquaresProblem(WeightedMatrix.of(matrix, np.arange(matrix.n_modes)), model)
+    problem = LeastSquaresProblem(WeightedMatrix.from_columns(matrix, np.arange(matrix.n_modes)), model)
     projected_jacobian = problem.linearise(start.to_array(), np.zeros(5)).projected_jacobian()
     return np.asarray(np.einsum("psm,qsm->mpq", projected_jacobian, projected_jacobian))
 
@@ -73,21 +72,19 @@ def mode_information(
 def choose_by_fisher_information(
     by_mode: NDArray[np.float64], n_modes: int, modes_choice: ModesChoice
 ) -> NDArray[np.intp]:
-    """Greedy choice of the modes that carry most information, in their own order.
+    """Greedy choice of the most informative modes, in ascending order.
 
-    One after the other that mode is taken which leaves the smallest error: the greedy algorithm reaches
-    63 % of the best gain in ``log det F`` at least (Nemhauser, Wolsey & Fisher 1978: it is submodular), and
-    the optimum itself takes a search through all subsets.
+    Each step adds the mode that minimises the error. The greedy algorithm reaches at least 63 % of the
+    largest possible increase of ``log det F``, which is submodular (Nemhauser, Wolsey & Fisher 1978); the
+    optimum would need a search through all subsets.
 
     Parameters
     ----------
-    by_mode
-        From :func:`mode_information`.
-    n_modes
-        How many to take.
-    choice
-        ``"d-optimal"``: least ``log det`` of the registration's covariance, the gain being unknown;
-        ``"a-optimal"``: least trace, in units of the longest step.
+    by_mode, n_modes
+        Information from :func:`mode_information`, and number of modes to choose.
+    modes_choice
+        ``"d-optimal"``: smallest ``log det`` of the covariance of the registration, with unknown gain;
+        ``"a-optimal"``: smallest trace, in units of the largest step.
     """
     scale = np.append(1.0, MAX_STEP)
     information = by_mode * np.outer(scale, scale)
@@ -95,7 +92,7 @@ def choose_by_fisher_information(
     accumulated = np.diag(np.maximum(_PRIOR_INFORMATION * total, np.finfo(float).tiny))
     remaining, chosen = list(range(len(information))), []
     for _ in range(min(n_modes, len(remaining))):
-        # The gain takes its share of the information away, whatever it is.
+        # Covariance of the registration with unknown gain.
         covariance = np.linalg.inv(accumulated + information[remaining])[:, 1:, 1:]
         if modes_choice == "d-optimal":
             cost = np.linalg.slogdet(covariance)[1]

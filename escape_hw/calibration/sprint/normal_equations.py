@@ -1,7 +1,8 @@
-"""What a synthetic model does not know: random effects that SPRINT fits beside the registration.
+"""Priors and normal equations of the mixed-effects fit.
 
-Each effect has a prior of zero mean (its scatter among instruments of a kind), so that the data
-decide how much of it there is, and the registration's error bars include it.
+SPRINT fits the differences between the real system and the synthetic model as random effects beside the
+registration. Each effect has a prior of zero mean, with its scatter among instruments of a kind, so that the
+data decide its size and the errors of the registration include it.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True, slots=True)
 class Priors:
-    """Prior scatter of the model's unknowns, relative (rms).
+    """Prior scatter of the random effects, relative (rms).
 
     Parameters
     ----------
@@ -25,18 +26,20 @@ class Priors:
     slope_gain
         Gains of single slopes: uneven light, spot size and alignment with the pixels.
     sampling
-        Where within its lenslet a slope samples the wavefront, in % of a sub-aperture; common to the
-        x slopes of a column and to the y slopes of a row, which fall on the pixels alike.
+        Position within its lenslet at which a slope samples the wavefront, in % of a sub-aperture; common
+        to the x slopes of a column and to the y slopes of a row, which have the same alignment with the
+        pixels.
     width, shape
         Common width of the influence functions, and the share of a broad pedestal in them.
     mean_width
-        Width to expect beyond nominal: zero, unless an earlier fit has told it.
+        Prior mean of the relative width beyond nominal: zero, or the value of an earlier fit.
     extras
-        Mean and scatter of each extra unknown, in its own prior scatters; zero and one, where none are
-        given because no earlier fit has told them.
-    shared
-        Variance of the noise in what an actuator moves, over that of as many slopes with noise of their own:
-        the fit takes noise for independent, so priors of the actuators' gains count by so much more.
+        Prior mean and scatter of each extra parameter, in units of its default scatter; zero and one where
+        none are given.
+    noise_inflation
+        Variance of the noise projected on the slopes of an actuator, relative to independent noise of the
+        same slopes. The fit assumes independent noise; the prior precision of the actuator gains is
+        multiplied by this factor instead.
     """
 
     actuator_gain: float = 0.1
@@ -57,22 +60,22 @@ class NormalEquations:
     The unknowns are, in order: the common parameters (gain, five of the registration, width, shape,
     shares of the model's variants), sampling positions, trends of the slope gains, actuator gains,
     actuator widths, slope gains.
-    A slope's gain touches no other slope, so its block is diagonal and is eliminated first.
+    The gain of a slope affects no other slope, so that block is diagonal and is eliminated first.
 
     Parameters
     ----------
     inner
         Normal matrix of all unknowns but the slope gains ``(n_inner, n_inner)``.
-    across
+    coupling
         Its coupling with the slope gains ``(n_slopes, n_inner)``.
     diagonal
-        The slope gains' own part ``(n_slopes,)``.
-    whole
+        The block of the slope gains ``(n_slopes,)``.
+    schur_complement
         ``inner`` with the slope gains eliminated.
-    right
-        Right-hand side of the whole system.
-    common, sampled, slopes_gain, slopes_width, modes, model, residual, lines, trends
-        As handed to :func:`normal_equations`.
+    right_hand_side
+        Of the whole system.
+    common, sampling_derivative, gain_derivative, width_derivative, modes, model, residual, lines, trends
+        Arguments of :func:`normal_equations`.
     """
 
     inner: NDArray[np.float64]
@@ -97,7 +100,7 @@ class NormalEquations:
 
     @property
     def matrix(self) -> NDArray[np.float64]:
-        """The whole normal matrix, written out."""
+        """The full normal matrix."""
         return np.block([[self.inner, self.coupling.T], [self.coupling, np.diag(self.diagonal)]])
 
     def solve(self) -> NDArray[np.float64]:
@@ -115,16 +118,16 @@ class NormalEquations:
             - schur_complement[:k, k:] @ np.linalg.solve(schur_complement[k:, k:], schur_complement[k:, :k])
         )
 
-    def noise(self, precision: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Covariance that the data's noise alone gives the common parameters ``(n_common, n_common)``.
+    def noise_covariance(self, precision: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Covariance of the common parameters due to the noise alone ``(n_common, n_common)``.
 
-        The inverse of :meth:`information` holds besides what the priors leave open, which is the same
-        in every repetition.
+        The inverse of :meth:`information` also contains the uncertainty due to the priors, which is the
+        same in every repetition.
 
         Parameters
         ----------
         precision
-            Prior precision of every unknown, as handed to :func:`normal_equations`.
+            Prior precision of every unknown, as in :func:`normal_equations`.
         """
         k, n = self.n_common, len(self.inner)
         inverse_columns = np.linalg.inv(self.schur_complement)[:, :k]
@@ -142,7 +145,7 @@ class NormalEquations:
         return np.concatenate([np.diag(inverse), of_slopes])
 
     def projected_jacobian(self) -> NDArray[np.float64]:
-        """Derivatives by the common parameters, less what the random effects can imitate.
+        """Derivatives by the common parameters, projected orthogonally to the random effects.
 
         Returns
         -------
@@ -164,10 +167,10 @@ class NormalEquations:
         return out
 
     def estimate_noise_inflation(self) -> float:
-        """See :attr:`Priors.noise_inflation`; told by what is left, the model's misfit included, and at least 1.
+        """Estimate :attr:`Priors.noise_inflation` from the residual, misfit included; at least 1.
 
-        The noise of neighbouring slopes is alike where the air is, so it does not average out over the slopes
-        that one actuator moves. Columns have independent noise, so they tell how little it does.
+        Turbulence correlates the noise of neighbouring slopes, so it does not average out over the slopes
+        of an actuator. The columns have independent noise, so the factor follows from their scatter.
         """
         observed = float(np.square(self.gain_derivative.T @ self.residual).sum())
         independent = float(np.square(self.gain_derivative).sum()) * self.residual.shape[1]
@@ -187,15 +190,15 @@ def normal_equations(
     lines: NDArray[np.intp] | None = None,
     trends: NDArray[np.float64] | None = None,
 ) -> NormalEquations:
-    """Assemble the system; no array of the size of all derivatives is ever formed.
+    """Assemble the system without forming the derivatives by all unknowns.
 
     Parameters
     ----------
     common
         Weighted derivatives by the common parameters ``(n_common, n_slopes, n_modes)``.
-    slopes_gain, slopes_width
-        Weighted zonal matrices ``(n_slopes, n_act)``: derivative by an actuator's gain or width is the
-        outer product of its column and its row of ``modes``.
+    gain_derivative, width_derivative
+        Weighted zonal matrices ``(n_slopes, n_act)``: the derivative by the gain or width of an actuator is
+        the outer product of its column and its row of ``modes``.
     modes
         Weighted mode-to-command matrix ``(n_act, n_modes)``.
     model, residual
@@ -204,11 +207,11 @@ def normal_equations(
         Prior precision of every unknown.
     offset
         Present value of every unknown minus its prior mean.
-    sampled, lines
-        Weighted derivatives of each slope by where it samples ``(n_slopes, n_modes)``, and the number
-        of the line of sub-apertures ``(n_slopes,)`` that it shares the unknown with; none by default.
+    sampling_derivative, lines
+        Weighted derivatives of each slope by its sampling position ``(n_slopes, n_modes)``, and the index
+        of the line of sub-apertures ``(n_slopes,)`` that shares that position; none by default.
     trends
-        What trends add to the gain of each slope ``(n_slopes, n_trends)``; none by default.
+        Changes of the slope gains per trend ``(n_slopes, n_trends)``; none by default.
     """
     if trends is None:
         trends = np.zeros((len(model), 0))
@@ -232,7 +235,7 @@ def normal_equations(
     by_line = member * (model * sampling_derivative).sum(axis=1)[:, None]
     by_acting = np.concatenate([model_modes * z for z in zonal], axis=1)
     power, score = np.square(model).sum(axis=1), np.einsum("sm,sm->s", model, residual)
-    # A trend is a sum of slope gains, and so are its products with everything else.
+    # A trend is a linear combination of slope gains, so its products follow from theirs.
     by_trend = trends * power[:, None]
     coupling = np.concatenate([by_common, by_line, by_trend, by_acting], axis=1)
     trend = trends.T @ coupling

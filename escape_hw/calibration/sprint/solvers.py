@@ -1,4 +1,8 @@
-"""The ways in which SPRINT solves its problem, each behind the same few words."""
+"""The solvers of SPRINT behind one function, :func:`solve`.
+
+The registration-only solvers are in :mod:`~.least_squares`; the Gauss-Newton iteration of the mixed-effects
+fit is here, its problem in :mod:`~.mixed_effects`.
+"""
 
 from __future__ import annotations
 
@@ -31,29 +35,21 @@ from escape_hw.config.choices import Solver
 
 T = TypeVar("T")
 
-#: Largest move in one iteration: the model is only locally linear.
+#: Largest step of a mixed-effects iteration, in the units of the parameters: the model is only locally
+#: linear, and more so with random effects, so it is half that of the registration-only solvers. Step norms
+#: of all solvers are in this unit.
 MAX_STEP = np.array([60.0, 60.0, 2.0, 4.0, 4.0])
-#: A step is halved, so many times at most, as long as it makes squares grow by more than this factor.
+#: A step is halved, at most so many times, while it increases the cost by more than this factor.
 _MAX_HALVINGS, _COST_TOLERANCE = 6, 1.02
-#: Steps that go to and fro are shortened down to this share, beyond which it is hopeless.
+#: Oscillating steps are shortened down to this fraction of the learning rate; then the descent gives up.
 _MIN_RATE_FRACTION = 0.125
-#: Solvers that take the columns for modes, and so need a matrix.
+#: Solvers that group or scale the columns as modes, and so need a matrix rather than telemetry.
 MATRIX_ONLY_SOLVERS: tuple[Solver, ...] = ("batches", "diagonal")
 
 
 @dataclass(slots=True, eq=False)
 class SolverContext:
-    """What is the same for every solver of one matrix, and the steps that were taken.
-
-    Parameters
-    ----------
-    matrix, model, columns
-        The measured matrix, the model, and which columns to fit.
-    solver, learning_rate, max_iterations, priors
-        As for :func:`~escape_hw.calibration.sprint.fit.sprint`.
-    extras
-        What to fit beside the registration.
-    """
+    """Inputs of a fit, as for :func:`~escape_hw.calibration.sprint.fit.sprint`, and its iterations."""
 
     matrix: InteractionMatrix
     model: SyntheticModel
@@ -70,7 +66,7 @@ class SolverContext:
         self.report = Reporter("SPRINT", self.max_iterations, "iteration")
 
     def progress(self, sigma: NDArray[np.float64] | None = None) -> Progress:
-        """The iterations so far; with the standard errors of the last ``(5,)`` once they are known."""
+        """The iterations so far, and the standard errors of the last one ``(5,)``, NaN while unknown."""
         rows = np.array([step.registration.to_array() for step in self.history]).reshape(-1, 5)
         errors = np.full(5, np.nan) if sigma is None else sigma
         arrays = {
@@ -83,13 +79,27 @@ class SolverContext:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SprintSolution:
-    """Where a descent ended, alike for every solver.
+    """Result of any solver.
 
-    ``zonal_matrix`` gives the matrix that was found ``(n_slopes, n_act)``, ``estimate_priors`` what the data say about the
-    scatter of the random effects, and ``actuator_corrections`` those of the mirror, where there are any; each is
-    worked out when asked for. ``added_covariance`` is what is to be added to the covariance of the registration
-    ``(5, 5)``; ``extras`` is what was fitted beside it; ``remaining_step`` is the whole step from where it
-    ended ``(5,)``.
+    Parameters
+    ----------
+    system
+        The linearised problem at the solution.
+    alpha, gain, width
+        Registration ``(5,)``, gain and relative width of the influence functions.
+    steps_converged
+        Whether the steps became negligible.
+    zonal_matrix
+        Computes the fitted matrix ``(n_slopes, n_act)``.
+    added_covariance
+        To be added to the covariance of the registration ``(5, 5)``.
+    estimate_priors, actuator_corrections
+        Compute the scatter of the random effects and the corrections of the actuators; ``None`` for
+        solvers without random effects.
+    extras
+        The fitted extra parameters.
+    remaining_step
+        The full step of the registration at the end ``(5,)``.
     """
 
     system: LinearisedProblem
@@ -108,52 +118,35 @@ class SprintSolution:
 def solve(
     context: SolverContext, weighted: WeightedMatrix, start: NDArray[np.float64], coarse_search: bool
 ) -> Procedure[SprintSolution]:
-    """Solve for a weighted matrix.
+    """Solve for weighted columns, from a registration ``start (5,)``, with the solver of the context.
 
-    Parameters
-    ----------
-    descent
-        Matrix, model and how to solve; the steps are kept there.
-    weighted
-        The columns, weighted.
-    start
-        Registration to start from ``(5,)``.
-    reach
-        Whether to come from afar first.
+    The iterations are recorded in the context. With ``coarse_search`` the start is searched from far away.
     """
-    model, rate, max_iterations = context.model, context.learning_rate, context.max_iterations
-    if context.solver in MATRIX_ONLY_SOLVERS:
+    model, solver, rate = context.model, context.solver, context.learning_rate
+    n = context.max_iterations
+    if solver in MATRIX_ONLY_SOLVERS:
         low = low_mode_problem(context.matrix, model, context.columns, rate) if coarse_search else None
         if low is not None:
-            start = (yield from _record_steps(low.descend(start, max_iterations), context)).alpha
-        if context.solver == "diagonal":
-            return _solution_from_least_squares(
-                (
-                    yield from _record_steps(
-                        DiagonalProblem(weighted, model, rate).descend(start, max_iterations), context
-                    )
-                ),
-                model,
-            )
-        steps = BatchProblem(weighted, model, rate).descend(start, max_iterations)
-        fit, added_covariance = yield from _record_steps(steps, context)
+            start = (yield from _record_steps(low.descend(start, n), context)).alpha
+        if solver == "diagonal":
+            steps = DiagonalProblem(weighted, model, rate).descend(start, n)
+            return _solution_from_least_squares((yield from _record_steps(steps, context)), model)
+        batches = BatchProblem(weighted, model, rate).descend(start, n)
+        fit, added_covariance = yield from _record_steps(batches, context)
         return _solution_from_least_squares(fit, model, added_covariance)
-    frozen = context.solver == "frozen-derivatives"
+    frozen = solver == "frozen-derivatives"
     if coarse_search:
-        search = search_registration(
-            context.matrix, model, context.columns, start, max_iterations, rate, frozen
-        )
-        least_squares_fit = yield from _record_steps(search, context)
-        start = least_squares_fit.alpha
-    # From afar all slopes count, those that the model is none of, too.
-    if context.solver != "mixed-effects" and (not coarse_search or isinstance(model, HasSlopeWeights)):
-        least_squares_fit = yield from _record_steps(
-            LeastSquaresProblem(weighted, model, rate, frozen).descend(start, max_iterations), context
-        )
-    if context.solver != "mixed-effects":
-        return _solution_from_least_squares(least_squares_fit, model)
-    problem = MixedEffectsProblem(weighted, model, context.priors, extras=context.extras)
-    return (yield from _fit_mixed_effects(problem, Registration.from_array(start), context))
+        search = search_registration(context.matrix, model, context.columns, start, n, rate, frozen)
+        fit = yield from _record_steps(search, context)
+        start = fit.alpha
+    if solver == "mixed-effects":
+        problem = MixedEffectsProblem(weighted, model, context.priors, extras=context.extras)
+        return (yield from _fit_mixed_effects(problem, Registration.from_array(start), context))
+    # The coarse search ignores slope weights.
+    if not coarse_search or isinstance(model, HasSlopeWeights):
+        steps = LeastSquaresProblem(weighted, model, rate, frozen).descend(start, n)
+        fit = yield from _record_steps(steps, context)
+    return _solution_from_least_squares(fit, model)
 
 
 def _solution_from_least_squares(
@@ -166,7 +159,7 @@ def _solution_from_least_squares(
 
 
 def _record_steps(steps: Generator[LeastSquaresFit, None, T], context: SolverContext) -> Procedure[T]:
-    """Hand on the progress of a descent and keep its steps."""
+    """Record the steps of a descent and report its progress."""
     while True:
         try:
             fit = next(steps)
@@ -182,8 +175,8 @@ def _record_steps(steps: Generator[LeastSquaresFit, None, T], context: SolverCon
 def _fit_mixed_effects(
     problem: MixedEffectsProblem, start: Registration, context: SolverContext
 ) -> Procedure[SprintSolution]:
-    """Gauss-Newton on registration and random effects together."""
-    state, steps_converged = problem.start(start), False
+    """Gauss-Newton iteration on registration and random effects together."""
+    state, steps_converged = problem.initial_state(start), False
     system = problem.linearise(state)
     rate, previous_step = context.learning_rate, np.zeros(5)
     for _ in range(context.max_iterations):
@@ -194,7 +187,7 @@ def _fit_mixed_effects(
         if not np.isfinite(step).all():
             break
         spread = np.sqrt(np.abs(np.diag(np.linalg.inv(system.information()))))[1:6]
-        spread *= problem.weighted.noise(system.residual)
+        spread *= problem.weighted.noise_level(system.residual)
         relative = np.abs(step[1:6]) / np.maximum(NEGLIGIBLE_STEP, 0.02 * spread)
         norm = float(np.linalg.norm(step[1:6] / MAX_STEP))
         context.history.append(_iteration_record(state.alpha, state.gain, system.residual, norm))
@@ -202,7 +195,7 @@ def _fit_mixed_effects(
             steps_converged = True
             break
         if step[1:6] / MAX_STEP @ previous_step < -0.5 * (previous_step @ previous_step):
-            # To and fro: what the model is not linear in sends each step back by as much as the last.
+            # Oscillation: nonlinearity of the model reverses each step.
             rate /= 2
             if rate < _MIN_RATE_FRACTION * context.learning_rate:
                 break
@@ -211,12 +204,14 @@ def _fit_mixed_effects(
         step = step * damping * rate
         state, system = _take_step(problem, state, system, step)
     else:
-        # The last step was a share of what was wanted then; this is what is wanted now.
+        # Not the last step, which was a fraction of the full one, but the full step from where it led.
         remaining_step = system.solve()[1:6]
     return SprintSolution(
         system, state.alpha, state.gain, 1 + state.width, steps_converged,
-        lambda: problem.zonal_matrix(state), estimate_priors=lambda: problem.estimate_priors(state, system),
-        extras=problem.extra_parameter_values(state), actuator_corrections=lambda: problem.actuator_corrections(state, system),
+        lambda: problem.zonal_matrix(state),
+        estimate_priors=lambda: problem.estimate_priors(state, system),
+        actuator_corrections=lambda: problem.actuator_corrections(state, system),
+        extras=problem.extra_parameter_values(state),
         remaining_step=remaining_step,
     )  # fmt: skip
 
@@ -224,10 +219,10 @@ def _fit_mixed_effects(
 def _take_step(
     problem: MixedEffectsProblem, state: MixedEffectsState, system: NormalEquations, step: NDArray[np.float64]
 ) -> tuple[MixedEffectsState, NormalEquations]:
-    """The state after a step, or after a part of it where the whole would make things clearly worse.
+    """The state after a step, halved while it clearly increases the cost.
 
-    Gain and shares multiply: on a pyramid that is far from its model at rest a whole step may end where
-    the model is another one.
+    The problem is bilinear in gain and variant shares, so on a pyramid far from the model without
+    modulated light a full step may overshoot.
     """
     largest_cost = _COST_TOLERANCE * _cost(problem, state, system)
     for _ in range(_MAX_HALVINGS):
@@ -240,7 +235,7 @@ def _take_step(
 
 
 def _cost(problem: MixedEffectsProblem, state: MixedEffectsState, system: NormalEquations) -> float:
-    """Squares of what is left and of the distances from the priors, in standard errors."""
+    """Sum of squares of the residual and of the distances from the priors, in standard errors."""
     offset = problem.offset(state)
     return float(np.vdot(system.residual, system.residual) + offset @ (problem.precision * offset))
 

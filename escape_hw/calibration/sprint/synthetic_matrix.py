@@ -1,4 +1,7 @@
-"""The pseudo-synthetic interaction matrix: the synthetic model at an estimated registration, with the fitted actuator corrections and propagated standard errors."""
+"""The pseudo-synthetic interaction matrix: the synthetic model at an estimated registration.
+
+It contains the fitted corrections of the actuators and has propagated standard errors.
+"""
 
 from __future__ import annotations
 
@@ -25,36 +28,29 @@ def compute_fitted_matrix(
     estimate: RegistrationEstimate,
     m2c: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Slopes per unit of each mode ``(n_slopes, n_modes)`` of the mirror that was found, at unit gain.
+    """Matrix of the fitted mirror at unit gain ``(n_slopes, n_modes)``.
 
-    Departures belong to actuators, so any basis will do, not only the one that was measured.
+    The corrections belong to the actuators, so any modal basis can be used.
 
     Parameters
     ----------
-    model
-        The synthetic model.
-    here
-        Where the mirror sits.
+    model, registration
+        The synthetic model, and the registration at which to compute the matrix.
     estimate
-        What SPRINT found of it, extra unknowns included; without departures, the drawing's mirror at the
-        estimated width.
+        Result of SPRINT, of which extra parameters, actuator corrections and width are used; without
+        corrections the mirror is the nominal one at the estimated width.
     m2c
         Modes ``(n_act, n_modes)``.
     """
     scaled_modes = _apply_actuator_gains(estimate, m2c)
-    return _add_corrections(
-        modal_matrix(model, registration, scaled_modes, estimate.width.value),
-        model,
-        registration,
-        estimate,
-        scaled_modes,
-    )
+    nominal = modal_matrix(model, registration, scaled_modes, estimate.width.value)
+    return _add_corrections(nominal, model, registration, estimate, scaled_modes)
 
 
 def compute_fitted_jacobian(
     model: SyntheticModel, estimate: RegistrationEstimate, m2c: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """The matrix at the estimated registration, its derivatives, and what unequal actuators leave open.
+    """Matrix of the fitted mirror, its derivatives, and its variance due to the actuators.
 
     Parameters
     ----------
@@ -67,28 +63,24 @@ def compute_fitted_jacobian(
     derivatives : ndarray, ``(6, n_slopes, n_modes)``
         By the five parameters of the registration and by the width.
     variance : ndarray, ``(n_slopes, n_modes)``
-        Of the matrix, from the errors of the actuators' gains; 0 without departures.
+        Of the matrix, from the errors of the actuator gains; 0 without actuator corrections.
     """
-    registration, corrections, width = (
-        estimate.registration,
-        estimate.actuator_corrections,
-        estimate.width.value,
-    )
+    registration, width = estimate.registration, estimate.width.value
+    corrections = estimate.actuator_corrections
     scaled_modes = _apply_actuator_gains(estimate, m2c)
     unit, derivatives = modal_jacobian(model, registration, scaled_modes, width)
     actuator_variance = np.zeros_like(unit)
     if corrections is not None:
         scaled_value, single = corrections.pedestal, model.zonal_matrix(registration, width)
-        derivatives = derivatives + scaled_value * (
-            pedestal_jacobian(model, registration, width, scaled_modes)[1] - derivatives
-        )
+        broad = pedestal_jacobian(model, registration, width, scaled_modes)[1]
+        derivatives = derivatives + scaled_value * (broad - derivatives)
         single = single + scaled_value * (model.zonal_matrix(registration, width * PEDESTAL) - single)
         actuator_variance = np.square(single) @ np.square(corrections.gain_sigma[:, None] * m2c)
     return _add_corrections(unit, model, registration, estimate, scaled_modes), derivatives, actuator_variance
 
 
 def _apply_actuator_gains(estimate: RegistrationEstimate, m2c: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Modes as actuators of unequal gains make them ``(n_act, n_modes)``."""
+    """Modes with the fitted gains of the actuators ``(n_act, n_modes)``."""
     corrections = estimate.actuator_corrections
     return m2c if corrections is None else (1 + corrections.gain)[:, None] * m2c
 
@@ -100,7 +92,7 @@ def _add_corrections(
     estimate: RegistrationEstimate,
     scaled_modes: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """A matrix with what extra unknowns add to it, and unequal widths and the pedestal to first order."""
+    """Add extra parameters, and to first order the widths of the actuators and the pedestal."""
     corrections, width = estimate.actuator_corrections, estimate.width.value
     for one in build_fitted_extra_parameters(model, estimate.extras):
         scaled_value = estimate.extras[one.name].value / one.prior_sigma
@@ -108,9 +100,8 @@ def _add_corrections(
     if corrections is None:
         return unit
     scaled_value, wider = corrections.pedestal, corrections.width[:, None] * scaled_modes
-    pedestal_change = modal_matrix(model, registration, scaled_modes, width * PEDESTAL) - modal_matrix(
-        model, registration, scaled_modes, width
-    )
+    broad = modal_matrix(model, registration, scaled_modes, width * PEDESTAL)
+    pedestal_change = broad - modal_matrix(model, registration, scaled_modes, width)
     own = modal_jacobian(model, registration, wider, width)[1][5]
     width_change = own + scaled_value * (pedestal_jacobian(model, registration, width, wider)[1][5] - own)
     return np.asarray(unit + scaled_value * pedestal_change + width * width_change)
@@ -119,21 +110,12 @@ def _add_corrections(
 def compute_pseudo_synthetic_matrix(
     model: SyntheticModel, estimate: RegistrationEstimate, m2c: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The model's matrix at an estimated registration, and its standard errors.
-
-    Parameters
-    ----------
-    model
-        The synthetic model.
-    estimate
-        Result of SPRINT; what it found of single actuators is in the matrix.
-    m2c
-        Modal basis ``(n_act, n_modes)``.
+    """Pseudo-synthetic matrix and its standard errors for modes ``m2c (n_act, n_modes)``.
 
     Returns
     -------
     matrix, sigma : ndarray, ``(n_slopes, n_modes)``
-        The errors are those of registration, gain and the actuators' gains, propagated to first order.
+        The errors are those of registration, gain and actuator gains, propagated to first order.
     """
     gain = estimate.gain.value
     unit, derivatives, actuator_variance = compute_fitted_jacobian(model, estimate, m2c)
@@ -146,19 +128,7 @@ def compute_pseudo_synthetic_matrix(
 def synthesise_calibration(
     bench: Bench, grid: SensorGeometry, estimate: RegistrationEstimate, m2c: NDArray[np.float64]
 ) -> CalibrationResult:
-    """A calibration made of a registration alone, with nothing moved.
-
-    Parameters
-    ----------
-    bench
-        Gives the model.
-    grid
-        The sensor's grid.
-    estimate
-        The registration.
-    m2c
-        Modal basis ``(n_act, n_modes)``.
-    """
+    """Calibration with the pseudo-synthetic matrix of an estimate for modes ``m2c``; moves no device."""
     data, sigma = compute_pseudo_synthetic_matrix(bench.model(grid), estimate, m2c)
     matrix = build_interaction_matrix(bench, grid, m2c, data, sigma, "escape", gain=estimate.gain.value)
     return CalibrationResult(matrix, grid, 0, 0, 0.0, registration=estimate)
@@ -167,17 +137,7 @@ def synthesise_calibration(
 def synthesise_from_measurement(
     measured: CalibrationResult, model: SyntheticModel, estimate: RegistrationEstimate
 ) -> CalibrationResult:
-    """The pseudo-synthetic matrix behind a measured one, with no bench at hand.
-
-    Parameters
-    ----------
-    measured
-        The calibration whose matrix was fitted.
-    model
-        The synthetic model on the geometry of that calibration.
-    estimate
-        The registration that fits it.
-    """
+    """The same for a measured calibration and a model on its geometry, without a bench."""
     data, sigma = compute_pseudo_synthetic_matrix(model, estimate, measured.matrix.m2c)
     matrix = replace(
         measured.matrix, data=data.astype(np.float32), sigma=sigma.astype(np.float32), method="escape",
@@ -187,23 +147,16 @@ def synthesise_from_measurement(
 
 
 def static_light_matrix(bench: Bench, calibration: CalibrationResult) -> InteractionMatrix | None:
-    """A pyramid's pseudo-synthetic matrix for light that hardly moves, as a closed loop leaves it.
+    """Pseudo-synthetic matrix of a pyramid for light that hardly moves, as in closed loop.
 
-    Under the turbulence of the open loop, where its matrix was fitted, a pyramid's answer has another shape.
-    Lenslets answer alike, and their model is the better for the motion, which averages over the pixels.
-    Nothing moves.
-
-    Parameters
-    ----------
-    bench
-        Gives the model.
-    calibration
-        With the registration.
+    The response of a pyramid under the turbulence of the open loop, where its matrix was fitted, has another
+    shape. For lenslets the response does not depend on the motion, and their model is better with it, because
+    it averages over the pixels. Moves no device.
 
     Returns
     -------
     InteractionMatrix or None
-        Of the same modes; ``None`` for a matrix that is not pseudo-synthetic, or not a pyramid's.
+        Of the same modes; ``None`` if the matrix is not pseudo-synthetic, or not of a pyramid.
     """
     estimate, pupils = calibration.registration, calibration.grid
     if estimate is None or calibration.matrix.method != "escape" or not isinstance(pupils, PyramidPupils):
@@ -213,18 +166,8 @@ def static_light_matrix(bench: Bench, calibration: CalibrationResult) -> Interac
     ).matrix
 
 
-def simulated(bench: Bench, grid: SensorGeometry, m2c: NDArray[np.float64]) -> CalibrationResult:
-    """What the model says of a mirror that stands where the design has it; nothing moves, nothing is fitted.
-
-    Parameters
-    ----------
-    bench
-        Gives the model.
-    grid
-        The sensor's grid.
-    m2c
-        Modal basis ``(n_act, n_modes)``.
-    """
+def nominal_calibration(bench: Bench, grid: SensorGeometry, m2c: NDArray[np.float64]) -> CalibrationResult:
+    """Calibration with the synthetic matrix at the nominal registration; moves no device."""
     data = modal_matrix(bench.model(grid), Registration(), m2c)
     matrix = build_interaction_matrix(bench, grid, m2c, data, np.zeros_like(data), "simulated")
     return CalibrationResult(matrix, grid, 0, 0, 0.0)

@@ -1,16 +1,15 @@
-"""SPRINT straight from whitened telemetry, with no interaction matrix in between.
+"""SPRINT directly from whitened telemetry, without an interaction matrix.
 
-Gain, registration and the few weights of the temporal response are some ten unknowns against a
-thousand slopes per frame, so fewer frames than modes are enough. With ``y`` the whitened slopes and
-``x`` the whitened pokes as seen through the response, the log-likelihood of ``y = D(g, alpha) x + e``
-depends on the frames through ``sum y x^T`` and ``sum x x^T`` alone. Turned onto the eigenvectors of
-the second, the first becomes a matrix whose columns have equal and independent noise
-(:func:`decorrelate_columns`), one for each direction that the pokes really took; SPRINT fits that.
+Gain, registration and the weights of the temporal response are some ten unknowns against a thousand slopes
+per frame, so fewer frames than modes are enough. With ``y`` the whitened slopes and ``x`` the whitened pokes
+convolved with the response, the log-likelihood of ``y = D(g, alpha) x + e`` depends on the frames through
+``sum y x^T`` and ``sum x x^T`` alone. Rotated to the eigenvectors of the second, the first becomes a matrix
+whose columns have equal and independent noise (:func:`decorrelate_columns`), one for each direction of the
+pokes; SPRINT fits that matrix.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -35,66 +34,65 @@ from escape_hw.calibration.docrime.whitening import (
     fit_history_filters,
     fit_prediction_error_filter,
 )
-from escape_hw.calibration.sprint.fit import fit_registration
+from escape_hw.calibration.sprint.fit import SprintOptions, fit_registration
 from escape_hw.calibration.sprint.normal_equations import Priors
-from escape_hw.config.choices import ActuatorModel, ExtraParameter, Loss, Solver
 from escape_hw.errors import TooFewFrames
 
-#: Rounds of registration, response, whitener and scatter; a fifth changes nothing that matters.
+#: Iterations over registration, response, whitening filter and priors; a fifth changes nothing relevant.
 _OPEN_LOOP_ROUNDS = 4
-#: In closed loop the matrix that closes it stands behind the first round, and has to be forgotten.
+#: The first iteration in closed loop uses the control matrix, whose influence needs two more to vanish.
 _CLOSED_LOOP_ROUNDS = 6
-#: Whitened frames without which no noise level is worth stating.
+#: Smallest number of whitened frames for an estimate of the noise.
 MIN_WHITENED_FRAMES = 12
-#: By how much more the scalings of short runs come out wrong alike on all plants, times the frames [%]: found
-#: over random plants on a twin with all imperfections, like the floor (docs/decisions).
+#: Systematic error of the scalings in short runs, times the number of frames, in %: from the development
+#: realisations of a twin with all imperfections, as MODEL_ERROR_FLOOR (docs/decisions).
 _SHORT_RUN_SIGMA = np.array([0.0, 0.0, 0.0, 0.8, 0.8])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TelemetryFit:
-    """What the telemetry says.
+    """Result of a fit to telemetry.
 
     Parameters
     ----------
     estimate
-        Registration and gain, with errors.
+        Registration and gain, with standard errors.
     response
-        The temporal response, its weights scaled to sum 1.
+        The temporal response, with weights of sum 1.
     whitener
-        The filter over time, for frames with a full past.
+        The whitening filter, for frames with a complete history.
     covariance
-        Covariance of one frame's whitened noise ``(n_slopes, n_slopes)``;
-        ``None`` with more than :data:`~escape_hw.calibration.docrime.regression.MAX_CORRELATED_SLOPES` slopes.
-    rows
-        Whitened frames that it rests on.
+        Covariance of the whitened noise of one frame ``(n_slopes, n_slopes)``; ``None`` with more than
+        :data:`~escape_hw.calibration.docrime.regression.MAX_CORRELATED_SLOPES` slopes.
+    n_frames
+        Number of whitened frames.
     """
 
     estimate: RegistrationEstimate
     response: TemporalResponse
     whitener: NDArray[np.float64]
     covariance: NDArray[np.float64] | None
-    rows: int
+    n_frames: int
 
 
 def decorrelate_columns(
     matrix: InteractionMatrix, gram: NDArray[np.float64], variance: NDArray[np.float64]
 ) -> InteractionMatrix:
-    """A least-squares matrix turned so that its columns have equal, independent noise.
+    """Rotate a least-squares matrix so that its columns have equal, independent noise.
 
     Parameters
     ----------
     matrix
-        ``D = (sum y x^T) (sum x x^T)^+``; fewer frames than modes are allowed.
+        ``D = (sum y x^T) (sum x x^T)^+``, from any number of frames.
     gram
         ``sum x x^T`` ``(n_modes, n_modes)``.
     variance
-        Variance of each slope's whitened noise in one frame ``(n_slopes,)``.
+        Variance of the whitened noise of each slope in one frame ``(n_slopes,)``.
 
     Returns
     -------
     InteractionMatrix
-        ``(n_slopes, rank)``, with the modes turned alike; its modes have no unit rms any more.
+        ``(n_slopes, rank)``, with modes rotated likewise, which do not have unit rms.
     """
     return whiten_columns(matrix, matrix.data @ gram, gram, gram, variance)
 
@@ -102,16 +100,16 @@ def decorrelate_columns(
 def telemetry_from_frames(
     index: NDArray[np.int64], slopes: NDArray[np.floating], pokes: NDArray[np.floating], before: int
 ) -> AlignedTelemetry:
-    """Frames on their time line, after ``before`` rows in which the mirror was flat.
+    """Telemetry with a row per frame period, after ``before`` rows with a flat mirror.
 
     Parameters
     ----------
     index
-        Frame indices ``(n,)``, rising.
+        Frame indices ``(n,)``, ascending.
     slopes, pokes
         ``(n, n_slopes)`` and ``(n, n_modes)``; each poke was sent after the frame of its row.
     before
-        Rows without slopes but with known pokes, of zero, in front.
+        Number of rows in front with zero pokes and without slopes.
     """
     at = index - index[0] + before
     n_slopes = slopes.shape[1]
@@ -119,7 +117,7 @@ def telemetry_from_frames(
     present = np.zeros(len(rows), np.bool_)
     rows[at, :n_slopes], rows[at, n_slopes:], present[at] = slopes, pokes, True
     for missing in np.flatnonzero(~present[before:]) + before:
-        # While a frame is lost the last poke stays on the mirror.
+        # The mirror keeps the last poke while a frame is lost.
         rows[missing, n_slopes:] = rows[missing - 1, n_slopes:]
     return AlignedTelemetry(rows, present, n_slopes)
 
@@ -131,42 +129,37 @@ def fit_telemetry(
     *,
     order: int,
     lags: int,
+    options: SprintOptions,
     start: Registration | None = None,
-    known: TemporalResponse | None = None,
-    learning_rate: float = 1.0,
-    solver: Solver = "mixed-effects",
-    loss: Loss = "squares",
-    also: Sequence[ExtraParameter] = (),
-    actuators: ActuatorModel = "fitted",
+    known_response: TemporalResponse | None = None,
 ) -> Procedure[TelemetryFit]:
-    """Registration, gain and temporal response from a stretch of telemetry.
+    """Fit registration, gain and temporal response to telemetry.
 
     Parameters
     ----------
     data
-        From :func:`telemetry_from_frames`, with at least ``2 order + lags`` rows in front; or of a closed loop, with
-        the commands of as many rows in front.
-    frame
-        A matrix of this sensor and basis: its mask, basis and provenance are used. Its data are used in
-        closed loop alone, where they are the one that closes it.
+        Telemetry of an open-loop run from :func:`telemetry_from_frames`, with at least ``2 order + lags``
+        rows in front; or of a closed loop, with the commands of as many rows in front.
+    template
+        A matrix of this sensor and basis, of which mask, basis and provenance are used; in closed loop the
+        control matrix, with which the first iteration starts.
     model
         The synthetic model on the same sub-apertures.
     order
-        Past frames that predict the turbulence, for frames that have so many before them; 0: nothing is
-        predicted.
+        Number of past frames from which the turbulence is predicted; 0: no prediction.
     lags
-        Frames over which the temporal response is estimated.
+        Number of frames of the temporal response.
+    options
+        Options of SPRINT; a solver for matrices only cannot be used.
     start
-        Where to start; from afar by default.
-    known
-        A temporal response to go on with for as long as the frames tell it no better.
-    learning_rate, solver, loss, also, actuators
-        As for :func:`~escape_hw.calibration.sprint.fit.sprint`; a solver that needs modes will not do.
+        Initial registration; by default it is searched from far away.
+    known_response
+        Temporal response to use while the frames do not determine it better.
 
     Raises
     ------
     TooFewFrames
-        Fewer than :data:`MIN_WHITENED_FRAMES` whitened frames; says how many there are.
+        Fewer than :data:`MIN_WHITENED_FRAMES` whitened frames.
     CalibrationError
         The slopes do not follow the pokes.
     """
@@ -175,31 +168,34 @@ def fit_telemetry(
     priors, n_effective_parameters = Priors(), 0.0
     rounds = _CLOSED_LOOP_ROUNDS if data.closed else _OPEN_LOOP_ROUNDS
     for number in range(rounds):
-        frames = _WhitenedFrames.of(data, filters, lags)
+        frames = _WhitenedFrames.from_telemetry(data, filters, lags)
         n = len(frames.slopes)
         if n < MIN_WHITENED_FRAMES:
             raise TooFewFrames(
                 f"{n} whitened frames are too few for a registration; "
                 f"at least {MIN_WHITENED_FRAMES + min(order, 1)} frames are needed, most of them in a row"
             )
-        response = _initial_response(frames) if matrix is None else _estimate_response(frames, matrix, known)
-        slopes = frames.slopes
-        residual = slopes if matrix is None else slopes - frames.delayed_commands(response.weights) @ matrix.T
+        slopes = residual = frames.slopes
+        if matrix is None:
+            response = _initial_response(frames)
+        else:
+            response = _estimate_response(frames, matrix, known_response)
+            residual = slopes - frames.delayed_commands(response.weights) @ matrix.T
         degrees_of_freedom = max(n - 1 - n_effective_parameters / slopes.shape[1], 1.0)
         variance = np.square(residual).sum(axis=0) / degrees_of_freedom
         covariance = residual.T @ residual / n if residual.shape[1] <= MAX_CORRELATED_SLOPES else None
+        iteration_options = options.copy()
+        if number < rounds - 1:  # Corrections of single actuators are needed from the last iteration only.
+            iteration_options["actuator_model"] = "nominal"
         fit = yield from fit_registration(
-            frames.columns(template, response.weights, matrix, variance), model,
-            solver=solver, loss=loss, start=start, learning_rate=learning_rate,
-            covariance=covariance, priors=priors, coarse_search=start is None, also=also,
-            # Single actuators are looked for once, in the end.
-            actuators=actuators if number == rounds - 1 else "nominal",
+            frames.columns(template, response.weights, matrix, variance), model, start=start,
+            covariance=covariance, priors=priors, coarse_search=start is None, **iteration_options,
         )  # fmt: skip
         start = fit.estimate.registration
         matrix = fit.zonal_matrix() @ template.m2c
         if fit.estimate_priors is not None:
-            estimate_priors = fit.estimate_priors()
-            priors, n_effective_parameters = estimate_priors.priors, estimate_priors.n_effective_parameters
+            prior_estimate = fit.estimate_priors()
+            priors, n_effective_parameters = prior_estimate.priors, prior_estimate.n_effective_parameters
         if order:
             filters = fit_history_filters(*_residual_slopes(data, matrix, response), order)
     estimate = fit.estimate
@@ -209,7 +205,7 @@ def fit_telemetry(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _WhitenedFrames:
-    """Whitened slopes ``(n, n_slopes)``, commands and pokes by lag ``(lags, n, n_modes)``, without constants.
+    """Whitened slopes ``(n, n_slopes)``, commands and pokes by lag ``(lags, n, n_modes)``, without means.
 
     In open loop the commands are the pokes.
     """
@@ -219,9 +215,11 @@ class _WhitenedFrames:
     pokes: NDArray[np.float64]
 
     @classmethod
-    def of(cls, data: AlignedTelemetry, filters: list[NDArray[np.float64]], lags: int) -> _WhitenedFrames:
+    def from_telemetry(
+        cls, data: AlignedTelemetry, filters: list[NDArray[np.float64]], lags: int
+    ) -> _WhitenedFrames:
         past = count_known_history(data.present, len(filters) - 1)
-        # Wherever the spots rest, nobody poked them there: a constant is free, filtered as the slopes are.
+        # The mean slopes are unknown: project out a constant, filtered as the slopes are.
         constant = apply_history_filters(np.ones((past.size, 1)), filters, past)
         constant /= max(float(np.linalg.norm(constant)), 1e-12)
 
@@ -236,7 +234,7 @@ class _WhitenedFrames:
         return cls(whiten(data.slopes), commands, by_lag(data.pokes) if data.closed else commands)
 
     def delayed_commands(self, response: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Commands as the slopes saw them ``(n, n_modes)``."""
+        """Commands convolved with the response ``(n, n_modes)``."""
         return np.asarray(np.tensordot(response, self.commands, axes=1))
 
     def columns(
@@ -246,10 +244,11 @@ class _WhitenedFrames:
         matrix: NDArray[np.float64] | None,
         variance: NDArray[np.float64],
     ) -> InteractionMatrix:
-        """What the frames say of the matrix, in columns with equal and independent noise.
+        """Sufficient statistics of the frames as a matrix whose columns have equal, independent noise.
 
-        In closed loop the pokes are the instruments of the commands, and what the best matrix makes of
-        the controller's part is taken out beforehand (:mod:`~escape_hw.calibration.docrime.regression`).
+        In closed loop the pokes are the instruments of the commands, and the contribution of the
+        controller, predicted with ``matrix``, is subtracted first
+        (:mod:`~escape_hw.calibration.docrime.regression`).
         """
         poked = np.tensordot(response, self.pokes, axes=1)
         sums = InstrumentalEquations.from_rows(self.slopes, self.delayed_commands(response), poked)
@@ -260,14 +259,14 @@ class _WhitenedFrames:
 
 
 def delay_rows(pokes: NDArray[np.floating], lag: int) -> NDArray[np.floating]:
-    """Pokes ``lag`` rows later; before the first the mirror was flat."""
+    """Pokes ``lag`` rows later, after a flat mirror."""
     return np.concatenate([np.zeros_like(pokes[:lag]), pokes[: len(pokes) - lag]])
 
 
 def _residual_slopes(
     data: AlignedTelemetry, matrix: NDArray[np.float64], response: TemporalResponse
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """What a matrix leaves of the slopes ``(n_times, n_slopes)``, and which rows are there."""
+    """Slopes minus the prediction of a matrix ``(n_times, n_slopes)``, and the rows present."""
     delayed_commands = sum(
         weight * delay_rows(data.commands, lag) for lag, weight in enumerate(response.weights)
     )
@@ -276,7 +275,7 @@ def _residual_slopes(
 
 
 def _initial_response(frames: _WhitenedFrames) -> TemporalResponse:
-    """All weight on the lag at which slopes and pokes go together most."""
+    """A response of one lag, that of the largest correlation of slopes and pokes."""
     power = [float(np.square(frames.slopes.T @ pokes).sum()) for pokes in frames.pokes]
     weights = np.zeros(len(power))
     weights[int(np.argmax(power))] = 1.0
@@ -286,10 +285,10 @@ def _initial_response(frames: _WhitenedFrames) -> TemporalResponse:
 def _estimate_response(
     frames: _WhitenedFrames, matrix: NDArray[np.float64], known: TemporalResponse | None
 ) -> TemporalResponse:
-    """Weights of the lags from what a matrix predicts, scaled to sum 1, with errors by frames.
+    """Weights of the lags, scaled to sum 1, with errors from the scatter over frames.
 
-    In closed loop what the pokes alone make are the instruments of what the commands make. A known
-    response stays while its errors are smaller and nothing speaks against it.
+    In closed loop the slopes predicted from the pokes are the instruments of those predicted from the
+    commands. A known response is kept while its errors are smaller and the data do not contradict it.
     """
     predicted = frames.commands @ matrix.T
     poked = predicted if frames.commands is frames.pokes else frames.pokes @ matrix.T
@@ -298,7 +297,7 @@ def _estimate_response(
     bread = np.linalg.inv(by_pokes @ flat.T)
     weights = bread @ (by_pokes @ frames.slopes.ravel())
     residual = frames.slopes - np.tensordot(weights, predicted, axes=1)
-    # Neighbouring slopes err together, whitened frames do not.
+    # The noise is correlated over slopes and independent over whitened frames.
     scores = np.einsum("lts,ts->lt", poked, residual)
     total = float(weights.sum())
     weights = weights / total
@@ -311,21 +310,18 @@ def _estimate_response(
 def fit_whitener(
     data: AlignedTelemetry, matrix: NDArray[np.float64], response: TemporalResponse, order: int, lags: int
 ) -> NDArray[np.float64]:
-    """Prediction-error filter of what the pokes do not explain.
+    """Fit the prediction-error filter of the residual slopes.
 
     Parameters
     ----------
     data
-        Slopes and pokes (or, in closed loop, total commands).
-    matrix
-        ``(n_slopes, n_modes)``.
-    response
-        Temporal response.
+        Slopes and pokes, or in closed loop total commands.
+    matrix, response
+        Interaction matrix ``(n_slopes, n_modes)`` and temporal response.
     order, lags
-        Past frames that the filter uses, and frames of the response.
+        Past frames of the filter, and frames of the response.
     """
     at = np.arange(lags - 1, data.present.size)
-    predicted_slopes = apply_filter(data.rows, response.weights, at, data.n_slopes) @ matrix.T.astype(
-        np.float32
-    )
+    commands = apply_filter(data.rows, response.weights, at, data.n_slopes)
+    predicted_slopes = commands @ matrix.T.astype(np.float32)
     return fit_prediction_error_filter(data.slopes[at] - predicted_slopes, data.present[at], order)

@@ -1,4 +1,4 @@
-"""Alarms of the tracker: what a new registration does not explain."""
+"""Alarms of the tracker: changes of the system that a new registration does not explain."""
 
 from __future__ import annotations
 
@@ -13,30 +13,24 @@ from escape_hw.api.tracking import Alarm
 from escape_hw.calibration.docrime.response import responses_differ
 from escape_hw.calibration.tracking.live_registration import LiveEstimate
 
-#: Standard errors that an update may miss what was expected by.
+#: Innovation of an update, in standard errors, above which the registration has jumped.
 INNOVATION_LIMIT = 8.0
-#: Mean square misfit of an update's own frames beside the usual from which on the model does not hold; and
-#: how loud they may be beside the usual.
+#: Misfit and noise of an update, relative to their medians, above which the model does not fit or the slopes
+#: are too noisy.
 MISFIT_FACTOR, NOISE_FACTOR = 2.5, 2.0
-#: An actuator that answers by less or more than this beside the others is not what the model takes it for.
+#: Relative gain of an actuator, beyond the common one, that raises an alarm.
 ACTUATOR_GAIN_LIMIT = 0.5
-#: Updates after an alarm in which nothing is exchanged, and which alarms of one kind are one.
+#: Updates after an alarm without an exchange, and in which an alarm of the same kind is not repeated.
 QUIET_UPDATES = 5
-#: Updates that tell what is usual.
+#: Updates of the running medians.
 _BASELINE_UPDATES = 30
 
 
 class AlarmMonitor:
-    """Looks at every update.
+    """Checks every update for changes that a new registration does not explain.
 
-    Parameters
-    ----------
-    start
-        Registration that tracking began with.
-    max_shift
-        How far the mirror may shift before a new calibration is due, % of a sub-aperture.
-    response
-        The temporal response that the matrix was measured with, where it is known.
+    ``start`` and ``response`` are registration and temporal response at the start; a shift of the mirror
+    above ``max_shift`` [% of a sub-aperture] needs a new calibration.
     """
 
     def __init__(
@@ -50,11 +44,11 @@ class AlarmMonitor:
 
     @property
     def is_quiet(self) -> bool:
-        """Whether there was no alarm lately."""
+        """Whether the last updates raised no alarm."""
         return all(self._updates - at > QUIET_UPDATES for at in self._last.values())
 
     def check(self, live: LiveEstimate, seconds: float) -> list[Alarm]:
-        """New alarms of an update; one of a kind that is on already is not repeated."""
+        """New alarms of an update; an alarm of a kind that was raised recently is not repeated."""
         self._updates += 1
         new_alarms = []
         for kind, text in self._find_anomalies(live).items():
@@ -64,50 +58,50 @@ class AlarmMonitor:
         if not new_alarms:
             self._noise.append(live.noise)
             self._misfit.append(live.misfit)
-        # The live registration goes on with the response that it measures: told once.
+        # A changed response is reported once, because later updates use it.
         self._response = live.response
         return new_alarms
 
     def _find_anomalies(self, live: LiveEstimate) -> dict[str, str]:
         new_alarms = {}
-        if live.surprise > INNOVATION_LIMIT:
+        if live.innovation > INNOVATION_LIMIT:
             new_alarms["jump"] = (
-                f"registration or gain jumped by {live.surprise:.1f} standard errors within one update; "
-                "the live registration starts anew"
+                f"registration or gain jumped by {live.innovation:.1f} standard errors within one update; "
+                "the live registration is restarted"
             )
         misfit = _baseline(self._misfit)
         if live.misfit > MISFIT_FACTOR * max(misfit, 1.0):
             new_alarms["misfit"] = (
-                f"the slopes do not follow the pokes as any registration would have it (mean square misfit "
-                f"{live.misfit:.2f} of the noise, usually {misfit:.2f}); look for dead actuators, a changed "
-                "flip, lost light"
+                f"no registration explains the response of the slopes to the pokes (mean square misfit "
+                f"{live.misfit:.2f} of the noise, usually {misfit:.2f}); check for dead actuators, a changed "
+                "flip, or lost light"
             )
         baseline = _baseline(self._noise)
         if live.noise > NOISE_FACTOR * baseline:
             new_alarms["noise"] = (
-                f"the slopes move {live.noise / baseline:.1f} times as much as usual beyond what the mirror "
-                "explains; is there enough light, or does something vibrate?"
+                f"the noise of the slopes is {live.noise / baseline:.1f} times as large as usual; check for "
+                "low light and vibrations"
             )
         if self._response is not None and responses_differ(live.response, self._response):
             new_alarms["delay"] = (
-                f"the mirror answers after {live.response.delay:.2f} frames, not {self._response.delay:.2f}; "
-                "look for another exposure or frame rate, or a computer that is late"
+                f"the delay is {live.response.delay:.2f} frames instead of {self._response.delay:.2f}; check "
+                "exposure, frame rate, and the latency of the computer"
             )
         worst = int(np.argmax(np.abs(live.actuator_gains)))
         if abs(live.actuator_gains[worst]) > ACTUATOR_GAIN_LIMIT:
             new_alarms["actuator"] = (
-                f"actuator {worst} answers by {1 + live.actuator_gains[worst]:.0%} of the others; check it, and "
-                "disable it (devices.dm.limits.disabled) if it is dead"
+                f"actuator {worst} has {1 + live.actuator_gains[worst]:.0%} of the gain of the others; "
+                "check it, and disable it (devices.dm.limits.disabled) if it is dead"
             )
         moved = float(np.abs(live.registration.registration.to_array() - self._start)[:2].max())
         if moved > self._max_shift:
             new_alarms["limit"] = (
                 f"the mirror has shifted by {moved:.0f} % of a sub-aperture since the start, more than "
-                f"tracking.max_shift ({self._max_shift:g}); calibrate anew"
+                f"tracking.max_shift ({self._max_shift:g}); calibrate again"
             )
         return new_alarms
 
 
 def _baseline(values: Sequence[float]) -> float:
-    """Median of what was seen lately; infinite before there is enough of it."""
+    """Median of the recent values; infinite while there are too few."""
     return float(np.median(values)) if len(values) >= QUIET_UPDATES else float(np.inf)

@@ -1,4 +1,4 @@
-"""A new pseudo-synthetic matrix from the live registration, and the evidence for it."""
+"""Exchange of the reconstructor: a new pseudo-synthetic matrix compared with the matrix in use."""
 
 from __future__ import annotations
 
@@ -16,33 +16,24 @@ from escape_hw.calibration.sprint.synthetic_matrix import compute_pseudo_synthet
 from escape_hw.calibration.tracking.live_registration import LiveEstimate, scale_to_live_gains
 from escape_hw.pipeline.control.reconstructor import reconstructor
 
-#: A change counts when it is this many times what errors let one expect.
+#: Change of the matrix, in standard errors, above which it is significant.
 MIN_SIGNIFICANCE = 2.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ActiveReconstructor:
-    """What the loop runs with.
-
-    Parameters
-    ----------
-    matrix, reconstructor
-        ``(n_slopes, n_modes)`` and ``(n_modes, n_slopes)``.
-    registration
-        The registration behind the matrix.
-    gain
-        Mean gain of the modes beside the synthetic model's.
-    """
+    """The matrix and its reconstructor ``(n_modes, n_slopes)`` in use, and the registration of the matrix."""
 
     matrix: InteractionMatrix
     reconstructor: NDArray[np.float32]
     registration: RegistrationEstimate
+    #: Mean gain of the modes relative to the synthetic model.
     gain: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ExchangeProposal:
-    """A matrix to go on with, what it is better for, and whether it is worth it."""
+    """A new matrix, the evidence for it, and whether its change exceeds the threshold and the errors."""
 
     candidate: ActiveReconstructor
     evidence: Exchange
@@ -50,7 +41,7 @@ class ExchangeProposal:
 
 
 def invert_matrix(matrix: InteractionMatrix, dropped: int) -> NDArray[np.float32]:
-    """Reconstructor of a matrix, the weakest eigenmodes per stroke left out."""
+    """Reconstructor of a matrix without its weakest eigenmodes per stroke."""
     stroke = np.sqrt(np.mean(np.square(matrix.m2c), axis=0))
     return reconstructor(matrix.data, scale=stroke, dropped_modes=dropped)
 
@@ -62,54 +53,44 @@ def propose_exchange(
     in_use: ActiveReconstructor,
     dropped: int,
     seconds: float,
-    worth: float,
+    exchange_threshold: float,
 ) -> ExchangeProposal:
-    """Hold a matrix of the live registration against the one in use.
+    """Compare the matrix at the live registration with the one in use.
 
     Parameters
     ----------
-    made
-        Pseudo-synthetic, at the live registration and the live common gain.
-    model
-        The model that it comes from.
-    live
-        The live registration.
-    used
-        What the loop runs with.
+    synthetic, model
+        Pseudo-synthetic matrix at the live registration and the live common gain, and its model.
+    live, in_use
+        The live registration, and the matrix in use.
     dropped
-        Eigenmodes left out.
+        Number of eigenmodes that the reconstructor omits.
     seconds
-        Now.
-    worth
-        Relative change from which on an exchange is worthwhile.
+        Present time.
+    exchange_threshold
+        Relative change of the matrix above which an exchange is proposed.
     """
     new = scale_to_live_gains(synthetic, live)
     scale = float(np.linalg.norm(new.data))
     mismatch = float(np.linalg.norm(new.data - in_use.matrix.data)) / scale
-    change = Estimate(live.registration.gain.value, float(live.gains_sigma.mean()))
-    drift_only = replace(live.registration, covariance=live.change, gain=change)
-    sigma = (
-        float(np.linalg.norm(compute_pseudo_synthetic_matrix(model, drift_only, synthetic.m2c)[1])) / scale
-    )
+    live_gain = Estimate(live.registration.gain.value, float(live.gains_sigma.mean()))
+    drift_only = replace(live.registration, covariance=live.change_covariance, gain=live_gain)
+    errors = compute_pseudo_synthetic_matrix(model, drift_only, synthetic.m2c)[1]
+    sigma = float(np.linalg.norm(errors)) / scale
     loop = np.linalg.eigvals(in_use.reconstructor.astype(float) @ new.data.astype(float))
-    # Dropped eigenmodes are left alone by every matrix.
+    # The loop gain of dropped eigenmodes is 0.
     loop_gains = np.sort(np.abs(loop))[dropped:]
     now, then = live.registration, in_use.registration
-    registration_change = now.registration.to_array() - then.registration.to_array()
-    errors = np.sqrt(np.diag(live.change))
+    moved = now.registration.to_array() - then.registration.to_array()
+    errors = np.sqrt(np.diag(live.change_covariance))
     gain = float(live.gains.mean())
     evidence = Exchange(
         seconds, False,
-        {name: (float(m), float(s)) for name, m, s in zip(PARAMETERS, registration_change, errors, strict=True)},
+        {name: (float(m), float(s)) for name, m, s in zip(PARAMETERS, moved, errors, strict=True)},
         (gain / in_use.gain - 1, float(live.gains_sigma.mean()) / in_use.gain),
         mismatch, sigma, float(loop_gains[0]), float(loop_gains[-1]),
     )  # fmt: skip
-    exceeds_threshold = mismatch > max(worth, MIN_SIGNIFICANCE * sigma)
+    exceeds_threshold = mismatch > max(exchange_threshold, MIN_SIGNIFICANCE * sigma)
     return ExchangeProposal(
         ActiveReconstructor(new, invert_matrix(new, dropped), now, gain), evidence, exceeds_threshold
     )
-
-
-def accept_proposal(proposal: ExchangeProposal) -> Exchange:
-    """The evidence of a proposal that the loop runs with."""
-    return replace(proposal.evidence, accepted=True)

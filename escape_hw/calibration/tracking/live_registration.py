@@ -1,9 +1,9 @@
-"""A registration every second, from small pokes in a loop that keeps running.
+"""Live registration: one Gauss-Newton update of SPRINT per block of closed-loop telemetry.
 
-Sums over the whitened telemetry fade with a memory of some seconds (:mod:`~.fading_sums`); every update
-is one Gauss-Newton step of SPRINT on them from the last estimate, with the same unknowns as a full fit:
-gain, registration, what the model does not know, and on a pyramid the optical gains as a smooth curve
-over the modes. A straight line through the estimates (:mod:`~.straight_line`) takes out their lag.
+The updates use sums of the whitened telemetry with exponential forgetting
+(:mod:`~escape_hw.calibration.docrime.forgetting_sums`), start from the last estimate, and have the unknowns
+of a full fit: gain, registration, random effects, and on a pyramid the optical gains as a smooth curve over
+the modes. Double exponential smoothing (:class:`DoubleExponentialSmoother`) removes the lag of the memory.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.registration import Registration
 from escape_hw.api.results import Estimate, RegistrationEstimate, TemporalResponse
-from escape_hw.api.synthetic_model import HasSystematicError, SyntheticModel
+from escape_hw.api.synthetic_model import SyntheticModel
 from escape_hw.calibration.acquisition.telemetry import AlignedTelemetry
 from escape_hw.calibration.docrime.regression import ForgettingSums, whiten_columns
 from escape_hw.calibration.docrime.response import FilteredTelemetry, ResponseAccumulator, filter_telemetry
 from escape_hw.calibration.optical_gain.smoothing import compute_command_curves, gain_curve_basis
-from escape_hw.calibration.sprint.covariance import sandwich_covariance
+from escape_hw.calibration.sprint.covariance import sandwich_covariance, systematic_error
 from escape_hw.calibration.sprint.extra_parameters import build_fitted_extra_parameters, priors_from_fit
 from escape_hw.calibration.sprint.mixed_effects import (
     GAIN,
@@ -31,62 +31,66 @@ from escape_hw.calibration.sprint.mixed_effects import (
     MixedEffectsState,
 )
 from escape_hw.calibration.sprint.normal_equations import NormalEquations, Priors
-from escape_hw.calibration.sprint.slope_weights import apply_model_weights
 from escape_hw.calibration.sprint.synthetic_matrix import compute_fitted_matrix
 from escape_hw.calibration.sprint.telemetry_fit import fit_whitener
-from escape_hw.calibration.sprint.weighted_matrix import WeightedMatrix
-from escape_hw.calibration.tracking.smoothing import DoubleExponentialSmoother, SmoothedState
+from escape_hw.calibration.sprint.weighted_matrix import WeightedMatrix, apply_model_weights
 from escape_hw.errors import TooFewFrames
 
-#: Drift per second that is nothing unusual: relative gain, registration, coefficients of the gains' curve.
+#: Prior standard deviation of the drift per second: relative gain, registration; coefficients of the curve.
 _DRIFT_SIGMA = np.array([0.05, 0.5, 0.5, 0.02, 0.1, 0.1])
 _CURVE_DRIFT_SIGMA = 0.1
-#: Gauss-Newton steps of the first update, and largest step in standard deviations of what is usual.
+#: Gauss-Newton steps of the first update, and largest step of the registration.
 _FIRST_ITERATIONS, _MAX_STEP = 5, np.array([60.0, 60.0, 2.0, 4.0, 4.0])
-#: Least error of a width that is taken over.
+#: Smallest prior standard deviation of the width of the influence functions.
 _MIN_WIDTH_SIGMA = 0.005
-#: Updates after which the whitening filter is found anew, again and again.
+#: Updates between two estimates of the whitening filter.
 _WHITEN_EVERY = 15
-#: Whitened frames without which no update is made.
+#: Smallest number of whitened frames of an update.
 _MIN_FRAMES = 50
+#: Updates before the first innovation, and weight of an innovation in their running variance.
+_MIN_UPDATES, _LEARNING_RATE = 4, 0.15
+#: Squared mean innovation, relative to the variance of its noise, above which it counts as curvature.
+_BIAS_THRESHOLD = 3.0
+#: Limit of a squared innovation in the running variance, so that a jump hardly changes it.
+_MAX_INNOVATION = 36.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LiveEstimate:
-    """What an update says of the present.
+    """Result of an update, for the present time.
 
     Parameters
     ----------
     registration
-        Registration and gain, freed of the memory's lag, with errors.
-    change
-        Covariance of the registration ``(5, 5)`` without what errs alike at all times: that of a change.
+        Registration and gain, corrected for the lag of the memory, with standard errors.
+    change_covariance
+        Covariance of a change of the registration ``(5, 5)``, without errors that are constant in time.
     gains, gains_sigma
-        Gain of every mode ``(n_modes,)``: :attr:`matrix` projected on the synthetic model, so what slopes
-        take from a mode is in it, and what actuators take beyond the departures; and its error as a change.
-    rate
+        Gain of every mode ``(n_modes,)``, with the standard error of a change: :attr:`matrix` projected on
+        the synthetic model, so it includes the effects of slopes, and of actuators beyond the corrections.
+    drift_rate
         Drift per second ``(6,)``: gain, then the registration.
-    surprise
-        By how many standard errors the update's own frames missed what was expected, the worst of all.
+    innovation
+        Largest difference between the data of this update and their prediction, in standard errors.
     misfit
-        Mean square of what the update's own frames leave of the model, in units of their noise: 1 if the
-        model explains them.
+        Mean square residual of the data of this update, in units of their noise: 1 if the model explains
+        them.
     noise
-        Rms of a whitened slope that neither pokes nor controller explain, in the update's own frames.
-    actuators
+        Rms of a whitened slope in this block, without the contribution of the commands.
+    actuator_gains
         Relative gain of every actuator beyond the common one ``(n_act,)``.
     matrix
-        Everything fitted, random effects included ``(n_slopes, n_modes)``: what the loop really sees.
+        The fitted matrix, random effects included ``(n_slopes, n_modes)``.
     response
         Temporal response.
     """
 
     registration: RegistrationEstimate
-    change: NDArray[np.float64]
+    change_covariance: NDArray[np.float64]
     gains: NDArray[np.float64]
     gains_sigma: NDArray[np.float64]
-    rate: NDArray[np.float64]
-    surprise: float
+    drift_rate: NDArray[np.float64]
+    innovation: float
     misfit: float
     noise: float
     actuator_gains: NDArray[np.float64]
@@ -95,29 +99,28 @@ class LiveEstimate:
 
 
 class LiveRegistration:
-    """Follows a registration through blocks of telemetry.
+    """Tracks a registration through blocks of closed-loop telemetry.
 
     Parameters
     ----------
-    frame
-        The matrix that the loop runs with; its mask and basis are used, and its data to begin with.
+    template
+        The matrix in use, of which mask and basis are used, and for the first update the data.
     model
         The synthetic model on the same sub-apertures.
     start
-        Registration to start from, within SPRINT's linear reach. Its width of the influence functions,
-        which small pokes hardly show, is taken over with its error, and so are a shear or shifted images
-        where it tells of them; what it says of single actuators is what a matrix at the live registration
-        will have.
+        Initial registration, within the linear range of SPRINT. Small pokes hardly determine the width of
+        the influence functions, so it is a prior, as are the fitted extra parameters. The actuator
+        corrections are those of the matrices at the live registration.
     order, lags
-        Of the whitening filter and the temporal response, in frames.
+        Order of the whitening filter and length of the temporal response, in frames.
     memory
-        Updates after which a frame counts ``1 / e``; infinite: nothing is forgotten.
+        Updates after which the weight of a frame is ``1 / e``; infinite: no forgetting.
     step_s
         Seconds between updates.
-    curved
-        Coefficients of the optical gains' curve over the modes; 0: one gain for all.
+    n_curve_coefficients
+        Coefficients of the curve of optical gains over the modes; 0: one gain for all modes.
     response
-        Temporal response, where it is known.
+        Temporal response, if it is known.
     """
 
     def __init__(
@@ -136,12 +139,9 @@ class LiveRegistration:
         self._template, self._model, self._start = template, model, start.registration
         scatter = min(Priors().width, max(start.width.sigma, _MIN_WIDTH_SIGMA))
         self._extras = build_fitted_extra_parameters(model, start.extras)
-        self._priors = Priors(
-            width=scatter,
-            mean_width=start.width.value - 1,
-            extras=priors_from_fit(self._extras, start.extras),
-        )
-        # Small pokes tell little of single actuators: what the calibration found of them stays.
+        extras = priors_from_fit(self._extras, start.extras)
+        self._priors = Priors(width=scatter, mean_width=start.width.value - 1, extras=extras)
+        # Small pokes hardly determine single actuators, so the corrections of the calibration are kept.
         self._actuator_corrections = start.actuator_corrections
         self._order, self._lags, self._response = order, lags, response
         self._basis = gain_curve_basis(template.n_modes, n_curve_coefficients)
@@ -151,12 +151,12 @@ class LiveRegistration:
         self._drift_line = DoubleExponentialSmoother(
             self._forgetting_factor if self._forgetting_factor < 1 else 1 - 1e-9, step_s, drift_sigma
         )
-        # At the mean age of the sums, and now.
+        # Fitted matrix at the mean age of the sums, and extrapolated to the present.
         self._matrix = self._current_matrix = template.data.astype(np.float64)
         self.restart()
 
     def restart(self) -> None:
-        """Forget all frames; the last estimate is where the next one starts from."""
+        """Discard all frames; the next update starts from the last estimate."""
         self._sums = ForgettingSums.zeros(*self._template.data.shape)
         self._weights = ResponseAccumulator(self._lags)
         self._whitener: NDArray[np.float64] | None = None
@@ -166,23 +166,23 @@ class LiveRegistration:
 
     @property
     def memory_rows(self) -> int:
-        """Rows before a block's first new one that its filtered rows are made of."""
+        """Rows of history that the filters need before the first new row of a block."""
         return 2 * self._order + self._lags
 
     def update(self, data: AlignedTelemetry, start: int = 0) -> LiveEstimate:
-        """Take a block of frames and say where the mirror sits.
+        """Estimate the registration with one more block of frames.
 
         Parameters
         ----------
         data
-            Of a closed loop: slopes, total modal commands, and the pokes in them.
+            Closed-loop telemetry: slopes, total modal commands, and the pokes in them.
         start
-            First new row; the :attr:`memory_rows` before it are the past of the new ones.
+            First new row, after :attr:`memory_rows` rows of history.
 
         Raises
         ------
         TooFewFrames
-            Hardly a frame whose past is known.
+            Too few frames with a known history.
         """
         if self._updates < 2 or self._updates % _WHITEN_EVERY == 0:
             self._whiten(data, start)
@@ -191,7 +191,7 @@ class LiveRegistration:
         response = self._weights.response(self._response)
         delayed = block.excitation(response.weights)
         if self._state is None:
-            # The residual by the matrix in use is not the noise yet: fit once for a better one.
+            # The residual for the matrix in use includes its error: fit once for the noise.
             self._add_block(block, delayed)
             self._state = self._gauss_newton()[2]
             self._current_matrix, self._sums = self._matrix, ForgettingSums.zeros(*self._template.data.shape)
@@ -201,7 +201,7 @@ class LiveRegistration:
         return self._build_estimate(problem, system, self._state, block_sums, response)
 
     def _add_block(self, block: FilteredTelemetry, delayed: NDArray[np.float32]) -> ForgettingSums:
-        """Let the sums fade and add a block; the block's own sums."""
+        """Apply the forgetting factor, add a block, and return the sums of the block alone."""
         n_modes = self._template.n_modes
         block_sums = ForgettingSums.zeros(*self._template.data.shape)
         block_sums.add(
@@ -212,7 +212,7 @@ class LiveRegistration:
         return block_sums
 
     def _whiten(self, data: AlignedTelemetry, start: int) -> None:
-        """Find the filter, and the first time the response as well, on a block."""
+        """Estimate the whitening filter, and the first time the response as well, from a block."""
         first = self._whitener is None
         if first:
             self._whitener = np.array([1.0, -1.0]) if self._order else np.ones(1)
@@ -228,27 +228,26 @@ class LiveRegistration:
 
     def _filtered(self, data: AlignedTelemetry, start: int) -> FilteredTelemetry:
         if self._whitener is None:
-            raise RuntimeError("the filter comes first")
+            raise RuntimeError("the whitening filter has not been estimated")
         block = filter_telemetry(data, self._whitener, self._lags, start)
         if len(block.now) < _MIN_FRAMES:
             raise TooFewFrames(
-                f"{len(block.now)} frames whose past is known are too few for an update; "
+                f"{len(block.now)} frames with a known history are too few for an update; "
                 f"at least {_MIN_FRAMES} are needed"
             )
         return block
 
     def _gauss_newton(self) -> tuple[MixedEffectsProblem, NormalEquations, MixedEffectsState]:
-        """Gauss-Newton on the sums: one step, or several the first time."""
+        """Gauss-Newton on the sums: one step, or several for the first update."""
         state = self._state
         for _ in range(_FIRST_ITERATIONS if state is None else 1):
             columns = self._sums.build_columns(self._template, self._matrix)
-            weighted = apply_model_weights(
-                WeightedMatrix.of(columns, np.arange(columns.n_modes)), self._model
-            )
+            weighted = WeightedMatrix.from_columns(columns, np.arange(columns.n_modes))
+            weighted = apply_model_weights(weighted, self._model)
             problem = MixedEffectsProblem(
                 weighted, self._model, self._priors, self._command_curves, self._extras
             )
-            state = state or problem.start(self._start)
+            state = state or problem.initial_state(self._start)
             system = problem.linearise(state)
             step = system.solve()
             largest_ratio = float(np.max(np.abs(step[1:6]) / _MAX_STEP))
@@ -273,12 +272,9 @@ class LiveRegistration:
         self._current_matrix = problem.matrix(current_state, self._template.m2c)
         self._start = Registration.from_array(value[1:6])
         columns = whiten_columns(
-            self._template,
-            block_sums.cross,
-            block_sums.command_poke_products,
-            block_sums.gram,
+            self._template, block_sums.cross, block_sums.command_poke_products, block_sums.gram,
             self._sums.variance,
-        )
+        )  # fmt: skip
         residual = columns.data - self._current_matrix @ np.linalg.lstsq(self._template.m2c, columns.m2c)[0]
         residual /= columns.sigma
         gain, timing_sigma = present.value[GAIN], value[GAIN] * self._weights.gain_sigma(response)
@@ -294,15 +290,15 @@ class LiveRegistration:
             float(np.mean(np.square(system.residual))),
             actuator_corrections=self._actuator_corrections,
             extras={
-                one.unknown.name: one.to_estimate(sigma, _systematic_error(self._model))
+                one.model.name: one.to_estimate(sigma, systematic_error(self._model))
                 for one in problem.extra_parameter_values(state)
             },
         )
         unit = compute_fitted_matrix(self._model, self._start, estimate, self._template.m2c)
         gains = np.asarray((self._current_matrix * unit).sum(axis=0) / np.square(unit).sum(axis=0))
         return LiveEstimate(
-            estimate, present.random_covariance[1:6, 1:6], gains, self._gains_sigma(present, timing_sigma), present.rate[:6],
-            float(np.abs(present.surprise).max()),
+            estimate, present.random_covariance[1:6, 1:6], gains, self._gains_sigma(present, timing_sigma),
+            present.rate[:6], float(np.abs(present.innovation).max()),
             float(np.mean(np.square(residual))), float(np.sqrt(block_sums.variance.mean())),
             state.actuator_gain.copy(), self._current_matrix, response,
         )  # fmt: skip
@@ -310,22 +306,21 @@ class LiveRegistration:
     def _extrapolate_to_now(
         self, problem: MixedEffectsProblem, system: NormalEquations, state: MixedEffectsState
     ) -> SmoothedState:
-        """Gain, registration and curve now, without the memory's lag."""
+        """Gain, registration and curve at the present time, without the lag of the memory."""
         first_curve = _first_curve_index(problem)
         first_curve_index = SHAPE + 1 + first_curve
         selected = np.r_[0:6, first_curve_index : first_curve_index + len(self._command_curves)]
-        total_covariance = sandwich_covariance(problem.weighted, system, self._sums.covariance)[
-            np.ix_(selected, selected)
-        ]
-        noise = system.noise(problem.precision)[np.ix_(selected, selected)]
-        total_covariance[np.arange(1, 6), np.arange(1, 6)] += np.square(_systematic_error(self._model))
+        total_covariance = sandwich_covariance(problem.weighted, system, self._sums.covariance)
+        total_covariance = total_covariance[np.ix_(selected, selected)]
+        noise = system.noise_covariance(problem.precision)[np.ix_(selected, selected)]
+        total_covariance[np.arange(1, 6), np.arange(1, 6)] += np.square(systematic_error(self._model))
         eigenvalues, directions = np.linalg.eigh(total_covariance - noise)
         static = (directions * np.maximum(eigenvalues, 0.0)) @ directions.T
         values = np.concatenate([[state.gain], state.alpha, state.variant[first_curve:]])
         return self._drift_line.update(values, noise, static)
 
     def _gains_sigma(self, present: SmoothedState, timing_sigma: float) -> NDArray[np.float64]:
-        """Error of every mode's gain, by what the common gain and the curve err."""
+        """Standard error of the gain of every mode, from those of the common gain and the curve."""
         gain = present.value[GAIN]
         relative = 1 + present.value[6:] @ self._basis
         jacobian = np.concatenate([relative[None], np.zeros((5, relative.size)), gain * self._basis])
@@ -336,16 +331,144 @@ class LiveRegistration:
 
 
 def _first_curve_index(problem: MixedEffectsProblem) -> int:
-    """Shares of variants and extra unknowns, which come before those of the gains' curve."""
+    """Number of shares before those of the gain curve: of variants and extra parameters."""
     return problem.n_variants - len(problem.command_curves)
 
 
-def _systematic_error(model: SyntheticModel) -> NDArray[np.float64]:
-    """What a model itself is in doubt of, of the registration ``(5,)``."""
-    return model.registration_systematic_error if isinstance(model, HasSystematicError) else np.zeros(5)
-
-
 def scale_to_live_gains(matrix: InteractionMatrix, live: LiveEstimate) -> InteractionMatrix:
-    """A pseudo-synthetic matrix at the live gain, with each mode's own gain in place of the common one."""
+    """A pseudo-synthetic matrix with the live gain of each mode in place of the common gain."""
     ratio = live.gains / live.registration.gain.value
     return replace(matrix, data=(matrix.data * ratio).astype(np.float32), sigma=matrix.sigma * np.abs(ratio))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SmoothedState:
+    """Linear extrapolation to the present time.
+
+    Parameters
+    ----------
+    value, rate
+        Level ``(n,)`` and change per second ``(n,)``.
+    covariance, random_covariance
+        Covariance of the level ``(n, n)``, and its part that is independent from update to update.
+    innovation
+        Data of the last update minus their prediction ``(n,)``, in standard errors scaled to those of the
+        recent updates.
+    """
+
+    value: NDArray[np.float64]
+    rate: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    random_covariance: NDArray[np.float64]
+    innovation: NDArray[np.float64]
+
+
+class DoubleExponentialSmoother:
+    """Removes the lag of exponentially forgotten estimates of several parameters.
+
+    The estimate from exponentially forgotten sums is the mean of the true values over the memory, of age
+    ``A``. The same mean taken over those estimates has a larger age ``B``. For a linear drift the present
+    value is ``S + A (S - T) / (B - A)``, with ``S`` the first mean and ``T`` the second (Brown 1963, double
+    exponential smoothing, with the ages as they are while the memory fills).
+
+    Parameters
+    ----------
+    forgetting
+        Factor of the earlier weights at each update, in (0, 1).
+    step_s
+        Seconds between updates.
+    max_rate
+        Prior standard deviation of the drift per second ``(n,)``, relevant while the memory fills.
+    """
+
+    def __init__(self, forgetting: float, step_s: float, max_rate: NDArray[np.float64]) -> None:
+        self._forgetting, self._step_s, self._max_rate = forgetting, step_s, np.asarray(max_rate, float)
+        # Running variance of the innovations; survives a restart.
+        self._innovation_variance = np.ones(len(self._max_rate))
+        self.restart()
+
+    def restart(self) -> None:
+        """Discard all updates."""
+        n = len(self._max_rate)
+        self._weight = 0.0
+        self._mean, self._second = np.zeros(n), np.zeros(n)
+        # Weights of the noise of each update in both means, the oldest first.
+        self._first_shares, self._second_shares = np.zeros(0), np.zeros(0)
+        self._expected: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
+        self._mean_innovation, self._curvature_variance = np.zeros(n), np.zeros(n)
+
+    def update(
+        self, mean: NDArray[np.float64], noise: NDArray[np.float64], static: NDArray[np.float64]
+    ) -> SmoothedState:
+        """Add the estimate from the forgotten sums.
+
+        Parameters
+        ----------
+        mean
+            The estimate ``(n,)``.
+        noise, static
+            Covariances ``(n, n)`` of its noise, independent from frame to frame, and of its constant errors.
+        """
+        self._weight = self._forgetting * self._weight + 1
+        share = 1 / self._weight
+        new_estimate = self._mean + (mean - self._mean) / share
+        self._first_shares = np.append(self._first_shares * (1 - share), share)
+        self._second_shares = np.append(self._second_shares * (1 - share), 0) + share * self._first_shares
+        self._mean, self._second = mean, self._second + share * (mean - self._second)
+        first, second = self._first_shares, self._second_shares
+        ages = self._step_s * (np.arange(len(first))[::-1] + 0.5)
+        first_age, second_age = float(first @ ages), float(second @ ages)
+        single_update_covariance = noise / float(first @ first)
+        value, rate, variance = mean, np.zeros_like(mean), np.square(first_age * self._max_rate)
+        shares = np.broadcast_to(first, (len(mean), len(first)))
+        if second_age > first_age:
+            unshrunk_rate = (mean - self._second) / (second_age - first_age)
+            rate_variance = np.diag(single_update_covariance) * float(np.square(first - second).sum())
+            rate_variance = rate_variance / (second_age - first_age) ** 2
+            shrinkage = np.square(self._max_rate) / (np.square(self._max_rate) + rate_variance)
+            rate = shrinkage * unshrunk_rate
+            value = mean + first_age * rate
+            shares = first + (shrinkage * first_age / (second_age - first_age))[:, None] * (first - second)
+            variance = np.square(first_age * self._max_rate * (1 - shrinkage))
+        random_covariance = single_update_covariance * (shares @ shares.T) + np.diag(variance)
+        raw_innovation, curvature_variance = self._compute_innovation(new_estimate, single_update_covariance)
+        innovation = raw_innovation / np.sqrt(np.maximum(self._innovation_variance, 1.0))
+        self._innovation_variance += _LEARNING_RATE * (
+            np.minimum(np.square(raw_innovation), _MAX_INNOVATION) - self._innovation_variance
+        )
+        error_scale = np.sqrt(np.maximum(self._innovation_variance, 1.0))
+        random_covariance = random_covariance * np.outer(error_scale, error_scale)
+        random_covariance = random_covariance + np.diag(curvature_variance)
+        present = SmoothedState(value, rate, static + random_covariance, random_covariance, innovation)
+        # The data of the next update have a mean age of half a step.
+        self._expected = value + 0.5 * self._step_s * rate, np.diag(random_covariance)
+        self._trim()
+        return present
+
+    def _compute_innovation(
+        self, new_estimate: NDArray[np.float64], single_update_covariance: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Innovation in standard errors, and variance due to a curvature of the drift.
+
+        A curved drift makes the innovations of successive updates have the same sign: the square of their
+        running mean beyond its noise is added to the variance, and decays slowly, because an oscillation
+        turns round.
+        """
+        if self._expected is None or len(self._first_shares) < _MIN_UPDATES:
+            return np.zeros_like(new_estimate), np.zeros_like(new_estimate)
+        value, variance = self._expected
+        noise = np.diag(single_update_covariance) + variance
+        raw_innovation = new_estimate - value
+        self._mean_innovation += _LEARNING_RATE * (raw_innovation - self._mean_innovation)
+        threshold = _BIAS_THRESHOLD * noise * _LEARNING_RATE / (2 - _LEARNING_RATE)
+        excess = np.square(self._mean_innovation) - threshold
+        self._curvature_variance = np.maximum(excess, self._curvature_variance * (1 - _LEARNING_RATE / 2))
+        sigma = np.sqrt(noise + np.square(self._step_s * self._max_rate))
+        return raw_innovation / sigma, self._curvature_variance
+
+    def _trim(self) -> None:
+        """Drop the oldest weights once they are negligible."""
+        if len(self._first_shares) > 40 / (1 - self._forgetting):
+            half = len(self._first_shares) // 2
+            self._first_shares = self._first_shares[half:]
+            self._second_shares = self._second_shares[half:]

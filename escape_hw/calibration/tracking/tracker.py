@@ -1,4 +1,4 @@
-"""The tracker: closed loop with small pokes, live registration once per second, and exchange of the reconstructor."""
+"""The tracker: closed loop with small pokes, live registration, and exchange of the reconstructor."""
 
 from __future__ import annotations
 
@@ -31,7 +31,6 @@ from escape_hw.calibration.tracking.alarms import AlarmMonitor
 from escape_hw.calibration.tracking.exchange import (
     ActiveReconstructor,
     ExchangeProposal,
-    accept_proposal,
     invert_matrix,
     propose_exchange,
 )
@@ -41,94 +40,21 @@ from escape_hw.pipeline.psf.frame_stack import FrameStack
 from escape_hw.pipeline.psf.strehl import strehl
 from escape_hw.pipeline.statistics import MIN_SAMPLES
 
-#: What progress reports tell of the last look.
-PROGRESS_COLUMNS = ("shift_x", "shift_x_sigma", "shift_y", "shift_y_sigma", "rotation", "rotation_sigma",
-         "optical_gain", "optical_gain_sigma", "misfit")  # fmt: skip
-#: Updates that a picture of the registration's course shows.
-_MAX_PLOTTED_UPDATES = 4096
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class TrackerUpdate:
-    """What the frames up to a moment say, the matrix that follows, and the latest Strehl ratio.
-
-    Parameters
-    ----------
-    seconds
-        The moment, since the loop was closed.
-    live
-        The live registration.
-    made
-        The pseudo-synthetic matrix of it.
-    proposal
-        That matrix, scaled to the live gains, held against the one in use.
-    ratio
-        Strehl ratio and its error; NaN where there is none.
-    """
-
-    seconds: float
-    live: LiveEstimate
-    synthetic: CalibrationResult
-    proposal: ExchangeProposal
-    strehl: tuple[float, float]
-
-
-def build_row(
-    update: TrackerUpdate,
-    gains: NDArray[np.float64],
-    gains_sigma: NDArray[np.float64],
-    residual: NDArray[np.float64],
-    exchanged: bool,
-) -> dict[str, float]:
-    """An answer as a row of the track's table.
-
-    Parameters
-    ----------
-    answer
-        What a look said.
-    gains, gains_sigma
-        Gain of every mode beside the matrix that tracking began with ``(n_modes,)``, and its error.
-    residual
-        Residuals of the loop's frames since the last row, in nm ``(n,)``.
-    exchanged
-        Whether its matrix was taken into use.
-    """
-    live, parameters = update.live, update.live.registration.measured()
-    return {
-        "seconds": update.seconds,
-        **{name: one.value for name, one in parameters.items()},
-        **{f"{name}_sigma": one.sigma for name, one in parameters.items()},
-        "optical_gain": float(gains.mean()), "optical_gain_sigma": float(gains_sigma.mean()),
-        "misfit": live.misfit, "surprise": live.surprise, "noise": live.noise,
-        "mismatch": update.proposal.evidence.mismatch,
-        "residual_nm": float(np.sqrt(np.mean(np.square(residual)))) if residual.size else math.nan,
-        "strehl": update.strehl[0], "strehl_sigma": update.strehl[1], "exchanged": float(exchanged),
-    }  # fmt: skip
-
-
-def progress_arrays(result: TrackResult) -> dict[str, NDArray[np.float32]]:
-    """Course of the registration and present gains, in the units of streams."""
-    names = ("seconds", *PARAMETERS, *(f"{name}_sigma" for name in PARAMETERS))
-    history = np.array([result.rows[name][-_MAX_PLOTTED_UPDATES:] for name in names]).T
-    history[:, 1:] *= np.tile(TO_STREAM_UNITS, 2)
-    arrays = {
-        "registration_track": history,
-        "gains": result.optical_gain,
-        "gains_sigma": result.optical_gain_sigma,
-    }
-    return {name: array.astype(np.float32) for name, array in arrays.items()}
-
-
 log = logging.getLogger(__name__)
 
-#: Seconds between two looks at the registration.
+#: Seconds between two updates of the registration.
 STEP_S = 1.0
-#: Seconds after settling in which the slope statistics are measured.
+#: Seconds after settling in which the motion of the slopes is measured.
 _MOTION_S = 1.0
-#: Updates before the first exchange: the memory must hold something first.
+#: Updates before the first exchange, in which the memory fills.
 _FIRST_EXCHANGE = 3
-#: Updates over which a Strehl ratio is taken.
+#: Updates between two Strehl ratios.
 _STREHL_EVERY = 5
+#: Columns of the last update in progress reports.
+PROGRESS_COLUMNS = ("shift_x", "shift_x_sigma", "shift_y", "shift_y_sigma", "rotation", "rotation_sigma",
+         "optical_gain", "optical_gain_sigma", "misfit")  # fmt: skip
+#: Number of recent updates in the progress arrays.
+_MAX_PLOTTED_UPDATES = 4096
 
 
 def track(
@@ -145,43 +71,41 @@ def track(
     gain: float | None = None,
     model_psf: NDArray[np.float32] | None = None,
 ) -> Procedure[TrackResult]:
-    """Run the loop and follow what drifts.
+    """Run the loop and track the registration and the optical gains.
 
     Parameters
     ----------
-    bench
-        An open bench.
-    matrix, grid
-        The matrix to begin with, and its grid.
+    bench, matrix, grid
+        An open bench, the matrix at the start, and its geometry.
     seconds
-        How long.
+        Duration.
     registration
-        The registration behind the matrix; found from the matrix itself by default.
+        The registration of the matrix; fitted to the matrix by default.
     response
-        Temporal response, where it is known.
+        Temporal response, if it is known.
     poke
         Pokes are uniform in +-poke on every mode, rms surface as fraction of full stroke; as configured.
     memory_s
-        Time in which old frames fade; as configured by default.
+        Time in which the weight of a frame falls to ``1 / e``; as configured by default.
     exchange
-        Whether a new matrix may be taken into use without asking, within the configured limits; false:
-        new matrices are only proposed.
+        Whether a new matrix may be used without confirmation, within the configured limits; false: new
+        matrices are only proposed.
     gain
         Gain of the integrator; as configured by default.
     model_psf
-        PSF without turbulence; with it the Strehl ratio is followed, too.
+        PSF without turbulence; with it the Strehl ratio is measured as well.
 
     Returns
     -------
     TrackResult
-        ``partial`` when stopped early; ``stable`` false when the loop was lost.
+        ``partial`` when stopped early; ``stable`` false when the loop diverged or the sensor went dark.
 
     Raises
     ------
     ConfigError
-        A time, poke or memory that means nothing; nothing moved.
+        A duration, poke or memory out of range; nothing moved.
     IncompatibleProduct, CalibrationError
-        The matrix does not fit, cannot be inverted, or shows no registration; nothing moved.
+        The matrix does not fit the bench, cannot be inverted, or has no registration; nothing moved.
     """
     t = bench.config.tracking
     poke = t.poke if poke is None else poke
@@ -195,8 +119,23 @@ def track(
     return (yield from tracker.run(seconds))
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class TrackerUpdate:
+    """Result of one update of the tracker."""
+
+    #: Time of the last frame, since the loop was closed.
+    seconds: float
+    live: LiveEstimate
+    #: Pseudo-synthetic matrix at the live registration.
+    synthetic: CalibrationResult
+    #: That matrix at the live gains, compared with the one in use.
+    proposal: ExchangeProposal
+    #: Strehl ratio and its error; NaN without one.
+    strehl: tuple[float, float]
+
+
 class _Tracker:
-    """State of a run."""
+    """A run of the tracker: the loop in the calling thread, the updates in a worker thread."""
 
     def __init__(
         self,
@@ -216,7 +155,9 @@ class _Tracker:
         self.control = build_integrator(bench, matrix, grid, gain=gain)
         start = registration or sprint(matrix, bench.model(grid), **sprint_options_from_config(c))
         if not start.converged:
-            raise CalibrationError(f"no registration to begin with: {'; '.join(start.warnings)}")
+            raise CalibrationError(
+                f"the matrix has no registration to start from: {'; '.join(start.warnings)}"
+            )
         self.amplitude = compute_poke_amplitudes(bench, matrix.m2c, poke)
         self.response, self.memory = response, memory_s / STEP_S
         self.dropped = bench.config.loop.dropped_modes
@@ -232,9 +173,9 @@ class _Tracker:
         self.divergence_monitor = BlockResidualMonitor(DivergenceLimits.from_config(bench.config))
 
     def prepare(self, slope_statistics: SlopeStatistics) -> None:
-        """Build the model for the light that the closed loop leaves, and start on it; in the thread.
+        """Build the model for the closed loop and start the live registration; in the worker thread.
 
-        How a sensor answers depends on how much its light moves, and in closed loop that is less than
+        The response of the sensor depends on the motion of the slopes, which is smaller in closed loop than
         while the matrix was measured.
         """
         bench, matrix, start = self.bench, self.in_use.matrix, self.in_use.registration
@@ -273,7 +214,7 @@ class _Tracker:
         return result
 
     def _track(self, loop: RunningLoop, report: Reporter, pool: ThreadPoolExecutor) -> Procedure[None]:
-        """Second after second; the answer of each is taken up at the end of the next."""
+        """Run the loop second by second; the update of each second is used at the end of the next."""
         slope_statistics = SlopeStatistics(self.grid.n_slopes)
         rate = self.bench.wfs.settings.frame_rate_hz
         yield from self._forward_progress(loop.run(max(1, round(SETTLING_S * rate))), report, 0)
@@ -290,9 +231,11 @@ class _Tracker:
             steps = loop.run(self.frames, inject=self._draw_poke, observe=[self.buffer])
             yield from self._forward_progress(steps, report, second)
             if loop.record.diverged or self.divergence_monitor(loop.record, frames, shortened):
-                self._report_divergence()
+                self.result.stable = False
+                text = "the loop diverged and was opened; calibrate again"
+                self.result.alarms.append(Alarm(self._elapsed_s(), "diverged", text))
                 return
-            # A twin's clock stands still meanwhile; at a real bench the loop does not wait.
+            # The loop of a real bench does not wait for the update; the clock of a twin stands still.
             if self.pending_update is not None and (self.pending_update.done() or self.bench.simulated):
                 self._handle_update(loop)
             if self.pending_update is None:
@@ -302,7 +245,7 @@ class _Tracker:
                 )
 
     def _forward_progress(self, steps: Procedure[object], report: Reporter, done: int) -> Iterator[Progress]:
-        """Progress of the whole in place of a stretch's own, with what the last look said."""
+        """Progress of the whole run, with the numbers of the last update."""
         for step in steps:
             arrays, self.arrays = self.arrays, {}
             yield report(done, {**step.arrays, **arrays}, **step.metrics, **self.metrics)
@@ -315,7 +258,7 @@ class _Tracker:
         return (self.bench.wfs.now_ns() - self.result.start_ns) * 1e-9
 
     def _take_images(self, loop: RunningLoop) -> FrameStack | None:
-        """The science frames since the last ones, every few updates."""
+        """The science frames since the last Strehl ratio; ``None`` unless one is due."""
         if self.psf is None or self.updates % _STREHL_EVERY or loop.record.science.count < MIN_SAMPLES:
             return None
         images, loop.record.science = loop.record.science, FrameStack()
@@ -324,20 +267,20 @@ class _Tracker:
     def _update_registration(
         self, data: AlignedTelemetry, start: int, seconds: float, images: FrameStack | None
     ) -> TrackerUpdate | None:
-        """What a block of frames says, if there are enough of them; in the thread."""
+        """Update for a block of frames, ``None`` if there are too few; in the worker thread."""
         try:
             live = self.live.update(data, start)
         except TooFewFrames:
             return None
         synthetic = synthesise_calibration(self.bench, self.grid, live.registration, self.in_use.matrix.m2c)
-        worth = self.bench.config.tracking.exchange_threshold
         proposal = propose_exchange(
-            synthetic.matrix, self.model, live, self.in_use, self.dropped, seconds, worth
-        )
+            synthetic.matrix, self.model, live, self.in_use, self.dropped, seconds,
+            self.bench.config.tracking.exchange_threshold,
+        )  # fmt: skip
         return TrackerUpdate(seconds, live, synthetic, proposal, self._strehl(images))
 
     def _strehl(self, images: FrameStack | None) -> tuple[float, float]:
-        """Strehl ratio and its error; NaN without images, or when they are off the middle of the camera."""
+        """Strehl ratio and its error; NaN without images, or if they are not centred on the camera."""
         if images is None or self.psf is None:
             return math.nan, math.nan
         try:
@@ -348,7 +291,7 @@ class _Tracker:
         return peak.value, peak.sigma
 
     def _handle_update(self, loop: RunningLoop, running: bool = True) -> None:
-        """Book the answer that is waited for, raise alarms, exchange the matrix if the loop still runs."""
+        """Wait for the pending update, record it, raise alarms, and exchange the matrix if the loop runs."""
         update = None if self.pending_update is None else self.pending_update.result()
         self.pending_update = None
         if update is None:
@@ -366,17 +309,17 @@ class _Tracker:
             self.live.restart()
 
     def _exchange_matrix(self, proposal: ExchangeProposal, running: bool) -> bool:
-        """Take a matrix into use, or only propose it."""
+        """Use a proposed matrix if that is allowed, and record the proposal; whether it is in use."""
         limit = self.bench.config.tracking.exchange_limit
         allowed = running and self.exchange and proposal.evidence.mismatch <= limit
-        self.result.exchanges.append(accept_proposal(proposal) if allowed else proposal.evidence)
+        self.result.exchanges.append(replace(proposal.evidence, accepted=allowed))
         if allowed:
             self.control.set_reconstructor(proposal.candidate.reconstructor)
             self.in_use = proposal.candidate
         return allowed
 
     def _append_row(self, update: TrackerUpdate, loop: RunningLoop, exchanged: bool) -> None:
-        """Append a row, and keep the latest matrix."""
+        """Append a row to the result and store the latest matrix."""
         result, live, proposal = self.result, update.live, update.proposal
         relative, relative_sigma = live.gains / self.initial_gains, live.gains_sigma / self.initial_gains
         result.optical_gain, result.optical_gain_sigma = relative, relative_sigma
@@ -388,9 +331,40 @@ class _Tracker:
         self.metrics = {name: row[name] for name in PROGRESS_COLUMNS}
         self.arrays = progress_arrays(result)
 
-    def _report_divergence(self) -> None:
-        """The loop diverged."""
-        self.result.stable = False
-        self.result.alarms.append(
-            Alarm(self._elapsed_s(), "diverged", "the loop diverged and was opened; calibrate anew")
-        )
+
+def build_row(
+    update: TrackerUpdate,
+    gains: NDArray[np.float64],
+    gains_sigma: NDArray[np.float64],
+    residual: NDArray[np.float64],
+    exchanged: bool,
+) -> dict[str, float]:
+    """Row of the table for an update.
+
+    ``gains (n_modes,)`` are relative to the matrix at the start; ``residual (n,)`` is that of the frames
+    since the last row, in nm.
+    """
+    live, parameters = update.live, update.live.registration.parameters()
+    return {
+        "seconds": update.seconds,
+        **{name: one.value for name, one in parameters.items()},
+        **{f"{name}_sigma": one.sigma for name, one in parameters.items()},
+        "optical_gain": float(gains.mean()), "optical_gain_sigma": float(gains_sigma.mean()),
+        "misfit": live.misfit, "innovation": live.innovation, "noise": live.noise,
+        "mismatch": update.proposal.evidence.mismatch,
+        "residual_nm": float(np.sqrt(np.mean(np.square(residual)))) if residual.size else math.nan,
+        "strehl": update.strehl[0], "strehl_sigma": update.strehl[1], "exchanged": float(exchanged),
+    }  # fmt: skip
+
+
+def progress_arrays(result: TrackResult) -> dict[str, NDArray[np.float32]]:
+    """History of the registration, and present gains, in the units of streams."""
+    names = ("seconds", *PARAMETERS, *(f"{name}_sigma" for name in PARAMETERS))
+    history = np.array([result.rows[name][-_MAX_PLOTTED_UPDATES:] for name in names]).T
+    history[:, 1:] *= np.tile(TO_STREAM_UNITS, 2)
+    arrays = {
+        "registration_track": history,
+        "gains": result.optical_gain,
+        "gains_sigma": result.optical_gain_sigma,
+    }
+    return {name: array.astype(np.float32) for name, array in arrays.items()}

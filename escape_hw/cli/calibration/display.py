@@ -44,8 +44,8 @@ def show_calibration(
 
     context.show(status_line(simulated, result.partial), *format_calibration(result))
     if result.registration is not None:
-        planted = document.get("planted")
-        injected = None if planted is None else Registration(**planted)
+        values = document.get("injected")
+        injected = None if values is None else Registration(**values)
         context.show(rich_table(registration_table({"": result.registration}, injected)))
     context.show(*format_criteria(document["criteria"]), *format_products(document["products"]))
 
@@ -97,10 +97,10 @@ def show_track(
     context.show(status_line(simulated, result.partial))
     found = {name: Estimate(**value) for name, value in document["registration"].items()}
     if found:
-        injected = Registration(**document["planted_end"]) if document["planted_end"] else None
+        injected = Registration(**document["injected_end"]) if document["injected_end"] else None
         context.show(rich_table(parameters_table({"": found}, injected)))
-    if document["planted_note"]:
-        context.show(document["planted_note"])
+    if document["injected_note"]:
+        context.show(document["injected_note"])
     if result.optical_gain.size:
         value, sigma = result.optical_gain.mean(), result.optical_gain_sigma.mean()
         context.show(f"optical gain relative to the first matrix: {value:.3f} ± {sigma:.3f}")

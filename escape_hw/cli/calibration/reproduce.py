@@ -1,4 +1,4 @@
-"""``escape reproduce``: the paper's tables and figures on the twins, with a report."""
+"""``escape reproduce``: the paper's tables and figures in simulation, with a report."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import typer
 from escape_hw.cli import options
 from escape_hw.cli.context import CommandContext, command_context
 
-app = typer.Typer(help="The paper's tables and figures on the twins, with a report.", no_args_is_help=True)
+app = typer.Typer(help="The paper's tables and figures in simulation, with a report.", no_args_is_help=True)
 _SYSTEM = "razor-shwfs"
 _SystemOption = Annotated[str, typer.Option("--system", help="System to run on.")]
 
@@ -21,8 +21,9 @@ def shwfs(
     system: _SystemOption = _SYSTEM,
     frames: Annotated[int, typer.Option("--frames", min=1, help="Frames of the DO-CRIME run.")] = 10_000,
     loop_frames: Annotated[int, typer.Option("--loop-frames", min=1, help="Frames of each loop.")] = 30_000,
-    plants: Annotated[
-        int, typer.Option("--plants", min=0, help="Random plants for the curve of error against frames.")
+    realisations: Annotated[
+        int,
+        typer.Option("--realisations", min=0, help="Random registrations for the curve of error and frames."),
     ] = 4,
     out: options.Out = None,
     set: options.Set = None,
@@ -33,7 +34,7 @@ def shwfs(
 ) -> None:
     """Calibrate with and without a source, close the loop with every matrix, compare."""
     with command_context("reproduce shwfs", json=json, quiet=quiet) as context:
-        counts = {"frames": frames, "loop_frames": loop_frames, "realisations": plants}
+        counts = {"frames": frames, "loop_frames": loop_frames, "realisations": realisations}
         result, document = _run_case(
             context, "shwfs", counts, options.SystemSelection.of(system, set, seed, mode), out
         )
@@ -78,7 +79,7 @@ def maps(
     json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """A matrix measured on the sky beside its simulation, and the loop on ESCAPE's, with a dirty mirror."""
+    """Measured matrix beside its simulation, and loops on the sky, with a contaminated mirror."""
     with command_context("reproduce maps", json=json, quiet=quiet) as context:
         counts = {"frames": frames, "loop_frames": loop_frames}
         result, document = _run_case(
@@ -111,27 +112,29 @@ def table1(
 
 @app.command("all")
 def reproduce_all(
-    out: Annotated[Path, typer.Option("--out", help="Folder; each part gets a folder of its own in it.")],
+    out: Annotated[Path, typer.Option("--out", help="Folder with one folder for each part.")],
     only: Annotated[
         list[str] | None, typer.Option("--only", help="A part (table1, shwfs, pywfs, maps); repeatable.")
     ] = None,
     share: Annotated[
         float,
-        typer.Option("--share", min=0.001, max=1.0, help="Share of the frames: 0.1 to see that it works."),
+        typer.Option(
+            "--share", min=0.001, max=1.0, help="Share of the frames, such as 0.1 for a quick test."
+        ),
     ] = 1.0,
     sweeps: Annotated[
         list[Path] | None,
-        typer.Option("--sweep", metavar="RUN", help="A finished sweep to show beside; repeatable."),
+        typer.Option("--sweep", metavar="RUN", help="A finished sweep to include; repeatable."),
     ] = None,
     resume: Annotated[
-        bool, typer.Option("--resume", help="Take the parts that are finished in --out as they are.")
+        bool, typer.Option("--resume", help="Do not run the parts again that are finished in --out.")
     ] = False,
     set: options.Set = None,
     seed: options.Seed = None,
     json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Every table and figure one after the other, and a page that leads to their reports."""
+    """Every table and figure, and a page with links to their reports."""
     with command_context("reproduce all", json=json, quiet=quiet) as context:
         from escape_hw.cli.formatting import format_criteria
         from escape_hw.config.loader import load_system
@@ -187,9 +190,9 @@ def reproduce_all(
 @app.command("sky-time")
 def sky_time(
     system: _SystemOption = _SYSTEM,
-    plants: Annotated[int, typer.Option("--plants", min=2, help="Random plants.")] = 20,
+    realisations: Annotated[int, typer.Option("--realisations", min=2, help="Random registrations.")] = 20,
     frames: Annotated[
-        list[int] | None, typer.Option("--frames", min=1, help="Frames to take the errors at; repeatable.")
+        list[int] | None, typer.Option("--frames", min=1, help="Frames at which to estimate; repeatable.")
     ] = None,
     workers: Annotated[int, typer.Option("--workers", min=1, help="Parallel processes.")] = 2,
     set: options.Set = None,
@@ -204,7 +207,7 @@ def sky_time(
         config = context.load_config(options.SystemSelection.of(system, set, None, "sim"))
         counts = sorted(frames or campaign.FRAMES)
         procedure = campaign.sky_time(
-            system, plants=plants, frames=counts, overrides=set or [], workers=workers
+            system, realisations=realisations, frames=counts, overrides=set or [], workers=workers
         )
         curves, stop = context.run_keeping_partial(procedure)
         header_fields = documents.header_fields(
@@ -239,21 +242,18 @@ def _run_case(
     selection: options.SystemSelection,
     out: Path | None,
 ) -> tuple[Any, dict[str, Any]]:
-    """Open, run, close, keep; what an aborted run has measured is kept before it says so.
-
-    What the user sets goes after what the case plants in the twin.
-    """
+    """Run a case and save its result, also a partial one; the user's overrides follow those of the case."""
     from escape_hw.paper.cases import CASES, request_fields
 
     case = CASES[kind]
-    asked = request_fields(counts, selection.set, selection.seed)
+    request = request_fields(counts, selection.set, selection.seed)
     selection = replace(selection, set=(*case.overrides, *selection.set))
     config = context.load_config(selection)
     with context.run_folder(config, f"reproduce-{kind}", out) as folder:
         with context.bench(selection) as bench:
             from escape_hw.runtime.session.record import BenchRecord
 
-            record = replace(BenchRecord.from_bench(bench), asked=asked)
+            record = replace(BenchRecord.from_bench(bench), request=request)
             result, stop = context.run_keeping_partial(case.procedure(bench, **counts))
         with context.protect_saving(stop):
             document = case.save(folder, record, result, context.wall_seconds)
@@ -281,8 +281,8 @@ def _show_registration(context: CommandContext, columns: dict[str, Any], documen
     from escape_hw.report.tables import registration_table
 
     found = {label: item.registration for label, item in columns.items() if item.registration is not None}
-    planted = Registration(**document["planted"]) if document["planted"] else None
-    context.show(rich_table(registration_table(found, planted)))
+    injected = Registration(**document["injected"]) if document["injected"] else None
+    context.show(rich_table(registration_table(found, injected)))
 
 
 def _show_criteria(context: CommandContext, document: dict[str, Any]) -> None:

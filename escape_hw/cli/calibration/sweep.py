@@ -15,30 +15,26 @@ from escape_hw.cli.context import CommandContext, command_context
 
 if TYPE_CHECKING:
     from escape_hw.bench import Bench
-    from escape_hw.config.system import SystemConfig
     from escape_hw.errors import Aborted
     from escape_hw.io.run_folder import RunFolder
     from escape_hw.runtime.session.record import BenchRecord
     from escape_hw.runtime.sweep.description import SweepDescription
     from escape_hw.runtime.sweep.design import MatrixVariant
     from escape_hw.runtime.sweep.result import SweepResult
+    from escape_hw.runtime.sweep.workers import Workers
 
 
 @dataclass(frozen=True, slots=True)
 class _Request:
-    """How a new sweep is asked for."""
+    """The options of a new sweep; ``counts`` are the fields of its design."""
 
     im: tuple[Path, ...]
     gains: Path | None
     vary: tuple[str, ...]
-    numbers: dict[str, int]
+    counts: tuple[int, int, int, int]
     frames: int
     calibration_frames: int | None
-    sampler: str
-    metric: str
-    margin: float
-    storage: str | None
-    study: str
+    study: dict[str, Any]
     force: bool
 
 
@@ -65,10 +61,10 @@ def sweep(
     gain: Annotated[str | None, typer.Option("--gain", metavar="LOW:HIGH[:log]", help="Gain.")] = None,
     leak: Annotated[str | None, typer.Option("--leak", metavar="LOW:HIGH[:log]", help="Leak.")] = None,
     dropped_modes: Annotated[
-        str | None, typer.Option("--drop", metavar="LOW:HIGH", help="Dropped modes.")
+        str | None, typer.Option("--dropped-modes", metavar="LOW:HIGH", help="Dropped modes.")
     ] = None,
     delay: Annotated[
-        str | None, typer.Option("--delay", metavar="LOW:HIGH", help="Further delay of a twin, in frames.")
+        str | None, typer.Option("--delay", metavar="LOW:HIGH", help="Added delay in simulation, in frames.")
     ] = None,
     vary: Annotated[
         list[str] | None,
@@ -79,19 +75,22 @@ def sweep(
         ),
     ] = None,
     metric: Annotated[
-        str, typer.Option("--metric", help="Strehl ratio to judge by: peak, otf or encircled.")
+        str, typer.Option("--metric", help="Strehl ratio that is maximised: peak, otf or encircled.")
     ] = "peak",
     margin: Annotated[
-        float, typer.Option("--margin", help="Difference that does not matter, % Strehl.")
+        float, typer.Option("--margin", help="Largest difference that counts as equivalent, % Strehl.")
     ] = 1.0,
     candidates: Annotated[
-        int, typer.Option("--candidates", min=1, help="Parameters of each matrix that run again.")
+        int, typer.Option("--candidates", min=1, help="Parameter sets of each matrix that run again.")
     ] = 3,
-    heats: Annotated[
-        int, typer.Option("--replicates", min=1, help="Stretches of air they run again on.")
+    replicates: Annotated[
+        int, typer.Option("--replicates", min=1, help="Turbulence realisations they run on.")
     ] = 4,
-    finals: Annotated[
-        int, typer.Option("--final-replicates", min=6, help="Stretches of air for the best of each matrix.")
+    final_replicates: Annotated[
+        int,
+        typer.Option(
+            "--final-replicates", min=6, help="Turbulence realisations for the best of each matrix."
+        ),
     ] = 20,
     calibration_frames: Annotated[
         int | None,
@@ -103,12 +102,12 @@ def sweep(
     ] = None,
     storage: Annotated[
         str | None,
-        typer.Option("--storage", metavar="URL", help="Where trials are kept (default: SQLite in the run)."),
+        typer.Option("--storage", metavar="URL", help="Storage of the trials (default: SQLite in the run)."),
     ] = None,
     study: Annotated[str, typer.Option("--study", help="Name of the study in the storage.")] = "sweep",
     resume: Annotated[
         Path | None,
-        typer.Option("--resume", metavar="RUN", help="Go on with a sweep, or join it (its folder)."),
+        typer.Option("--resume", metavar="RUN", help="Resume a sweep, or join it (its folder)."),
     ] = None,
     force: options.Force = False,
     out: options.Out = None,
@@ -118,157 +117,126 @@ def sweep(
     json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Compare matrices, each at its own best gain, leak and number of modes, on the same air."""
+    """Compare matrices, each at its own best gain, leak and number of modes, on the same turbulence."""
     with command_context("sweep", json=json, quiet=quiet) as context:
+        from escape_hw.errors import ConfigError
         from escape_hw.runtime.sweep.request import parse_search_space, require_loop_frames, require_optuna
 
         require_optuna()
-        loop_ranges = {"gain": gain, "leak": leak, "dropped_modes": dropped_modes, "delay": delay}
-        loop_overrides = tuple(f"{key}={text}" for key, text in loop_ranges.items() if text is not None)
+        if (system is None) == (resume is None):
+            raise ConfigError("name a system (see 'escape systems') or a run with --resume, one of the two")
+        ranges = {"gain": gain, "leak": leak, "dropped_modes": dropped_modes, "delay": delay}
         request = _Request(
-            tuple(im or ()), gains, (*loop_overrides, *(vary or ())),
-            {"trials": trials, "candidates": candidates, "replicates": heats, "final_replicates": finals},
-            frames, calibration_frames, sampler, metric, margin / 100, storage, study, force,
+            tuple(im or ()), gains,
+            (*(f"{key}={text}" for key, text in ranges.items() if text is not None), *(vary or ())),
+            (trials, candidates, replicates, final_replicates),
+            frames, calibration_frames,
+            dict(sampler=sampler, metric=metric, margin=margin / 100, storage=storage, study=study),
+            force,
         )  # fmt: skip
-        selection = options.SystemSelection.of(_system(system, resume), set, seed, mode)
+        source = str(system if resume is None else resume / "config.toml")
+        selection = options.SystemSelection.of(source, set, seed, mode)
         config = context.load_config(selection)
         resumed = None
         if resume is None:
             parse_search_space(config, request.vary)
             require_loop_frames(config, frames)
         else:
-            resumed = _load_sweep(resume, storage)
-            if _is_finished(context, resume, resumed):
+            from escape_hw.runtime.sweep.description import read_description
+
+            resumed = read_description(resume, storage)
+            if _show_finished(context, resume, resumed):
                 return
         with context.run_folder(config, "sweep", out) as folder:
             with context.bench(selection) as bench:
                 from escape_hw.runtime.session.record import BenchRecord
 
                 record = BenchRecord.from_bench(bench)
-                description = resumed or _prepare_sweep(context, request, config, bench, folder, record)
+                description = resumed or _describe(context, request, bench, folder, record)
                 if not bench.simulated:
                     result, stop = _run(context, description, bench)
             if description.sweep.simulated:
-                result, stop = _run(context, description, _open_workers(workers, scheduler))
+                from escape_hw.runtime.sweep.workers import open_workers
+
+                result, stop = _run(context, description, open_workers(workers, scheduler))
             with context.protect_saving(stop):
-                _finish(context, folder, record, description, result)
+                _save(context, folder, record, description, result)
             if stop is not None:
                 raise stop
 
 
-def _system(system: str | None, resume: Path | None) -> str:
-    from escape_hw.errors import ConfigError
-
-    if (system is None) == (resume is None):
-        raise ConfigError("name a system (see 'escape systems') or a run with --resume, one of the two")
-    return str(system if resume is None else resume / "config.toml")
-
-
-def _load_sweep(run: Path, storage: str | None) -> SweepDescription:
-    from escape_hw.runtime.sweep.description import read_description
-
-    return read_description(run, storage)
-
-
-def _is_finished(context: CommandContext, run: Path, description: SweepDescription) -> bool:
-    """Whether the sweep has nothing left to run; then its result is shown where it lies."""
+def _show_finished(context: CommandContext, run: Path, description: SweepDescription) -> bool:
+    """Show the result of a sweep that has nothing left to run; false when something is left."""
     from escape_hw.runtime.sweep.products import find_finished_result
 
     document = find_finished_result(run, description)
     if document is None:
         return False
     context.notify(
-        f"{run} is finished since {document['finished_utc']}, nothing is left to run; its result is in "
+        f"{run} was finished on {document['finished_utc']}, nothing is left to run; its result is in "
         f"{document['folder']}"
     )
     _show(context, document)
     return True
 
 
-def _prepare_sweep(
-    context: CommandContext,
-    request: _Request,
-    config: SystemConfig,
-    bench: Bench,
-    folder: RunFolder,
-    record: BenchRecord,
+def _describe(
+    context: CommandContext, request: _Request, bench: Bench, folder: RunFolder, record: BenchRecord
 ) -> SweepDescription:
-    """Matrices and model PSF of a new sweep, and its description in the run's folder."""
-    import numpy as np
-
-    from escape_hw.runtime.procedures.calibration import model_psf
-    from escape_hw.runtime.sweep.description import SweepDescription
+    """Measure or read the matrices of a new sweep, and save its description in the folder."""
+    from escape_hw.runtime.sweep.description import describe_sweep
     from escape_hw.runtime.sweep.design import Design
     from escape_hw.runtime.sweep.request import parse_search_space
-    from escape_hw.runtime.sweep.run import Sweep
 
-    space = parse_search_space(config, request.vary)
-    arms = tuple(_sweep_variants(context, request, config, bench, folder, record))
-    psf = None
-    if all("." not in parameter.key for parameter in space):
-        psf = folder.file("model_psf.npy")
-        np.save(psf, context.run(model_psf(bench)))
-    swept = Sweep(
-        config.to_toml(), arms, space, Design(**request.numbers), request.frames, config.system.seed,
-        request.metric, None if psf is None else str(psf), bench.simulated,
-    )  # fmt: skip
-    storage = request.storage or f"sqlite:///{folder.file('study.db')}"
-    description = SweepDescription(swept, storage, request.study, request.sampler, request.margin).validate()
+    variants = _prepare_variants(context, request, bench, folder, record)
+    space, design = parse_search_space(bench.config, request.vary), Design(*request.counts)
+    description = context.run(
+        describe_sweep(bench, folder.path, variants, space, design, frames=request.frames, **request.study)
+    )
     description.save(folder.path)
     return description
 
 
-def _sweep_variants(
-    context: CommandContext,
-    request: _Request,
-    config: SystemConfig,
-    bench: Bench,
-    folder: RunFolder,
-    record: BenchRecord,
+def _prepare_variants(
+    context: CommandContext, request: _Request, bench: Bench, folder: RunFolder, record: BenchRecord
 ) -> list[MatrixVariant]:
     from escape_hw.errors import ConfigError
     from escape_hw.io.fits.gains import load_gains
     from escape_hw.runtime.procedures.matrix_input import load_fitting_matrix, require_hardware_matrix
     from escape_hw.runtime.sweep.matrices import measure_variants, read_variants, save_variants
 
+    config = bench.config
     if request.im:
         products = [load_fitting_matrix(path, config, request.force) for path in request.im]
         for product in products:
             require_hardware_matrix(product, bench, request.force)
-        known = None if request.gains is None else load_gains(request.gains).result
-        return read_variants(products, known, folder.path)
+        gains = None if request.gains is None else load_gains(request.gains).result
+        return read_variants(products, gains, folder.path)
     if request.gains is not None:
-        raise ConfigError("--gains goes with --im: the gains belong to matrices that exist")
+        raise ConfigError("--gains needs --im: optical gains belong to existing matrices")
     frames = request.calibration_frames or config.calibration.frames
     pyramid = config.sensor.kind == "pyramid"
-    measured_variants = context.run(
-        measure_variants(bench, frames=frames, gain_frames=frames if pyramid else 0)
-    )
-    return save_variants(folder, record, measured_variants)
-
-
-def _open_workers(count: int, scheduler: str | None) -> Any:
-    from escape_hw.runtime.sweep.workers import DaskWorkers, LocalWorkers
-
-    return LocalWorkers(count) if scheduler is None else DaskWorkers(scheduler)
+    measured = context.run(measure_variants(bench, frames=frames, gain_frames=frames if pyramid else 0))
+    return save_variants(folder, record, measured)
 
 
 def _run(
-    context: CommandContext, description: SweepDescription, runner: Any
+    context: CommandContext, description: SweepDescription, runner: Workers | Bench
 ) -> tuple[SweepResult, Aborted | None]:
     from escape_hw.bench import Bench
     from escape_hw.runtime.sweep.result import analyse_sweep
     from escape_hw.runtime.sweep.run import run_sweep
 
     try:
-        found, stop = context.run_keeping_partial(run_sweep(description.sweep, description.store(), runner))
+        procedure = run_sweep(description.open_study(), runner)
+        found, stop = context.run_keeping_partial(procedure)
     finally:
         if not isinstance(runner, Bench):
             runner.close()
     return analyse_sweep(description.sweep, found, description.margin), stop
 
 
-def _finish(
+def _save(
     context: CommandContext,
     folder: RunFolder,
     record: BenchRecord,
@@ -279,9 +247,9 @@ def _finish(
 
     _show(context, save_sweep(folder, record, description, result, context.wall_seconds))
     if result.partial:
-        context.notify(f"go on with: {shlex.join(['escape', 'sweep', '--resume', str(folder.path)])}")
+        context.notify(f"resume with: {shlex.join(['escape', 'sweep', '--resume', str(folder.path)])}")
     else:
-        description.store().set_result_folder(str(folder.path))
+        description.open_study().set_result_folder(str(folder.path))
 
 
 def _show(context: CommandContext, document: Mapping[str, Any]) -> None:

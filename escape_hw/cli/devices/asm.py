@@ -21,7 +21,9 @@ if TYPE_CHECKING:
     from escape_hw.api.adaptive_secondary import AdaptiveSecondary, ShellHealth
     from escape_hw.config.system import SystemConfig
 
-app = typer.Typer(help="Set, rest or ask an adaptive secondary, and clear its faults.", no_args_is_help=True)
+app = typer.Typer(
+    help="Set, rest or query an adaptive secondary, and clear its faults.", no_args_is_help=True
+)
 
 
 @app.command("status")
@@ -32,7 +34,7 @@ def status(
     mode: options.Mode = None,
     json: options.Json = False,
 ) -> None:
-    """Look at state and health; takes no control and moves nothing, whoever owns the mirror."""
+    """Show state and health; takes no control and moves nothing."""
     with command_context("asm status", json=json) as context:
         config, mirror = _secondary(context, options.SystemSelection.of(system, set, seed, mode))
         context.devices_opened = True
@@ -53,7 +55,7 @@ def set_(
     mode: options.Mode = None,
     json: options.Json = False,
 ) -> None:
-    """Float the shell, flat: MOVES it. It stays afloat under its own control when the command has ended."""
+    """Float the shell, flat: MOVES it. It stays afloat under its own control after the command."""
     with command_context("asm set", json=json) as context:
         _go_to_state(context, options.SystemSelection.of(system, set, seed, mode), "asm set", floating=True)
 
@@ -74,13 +76,13 @@ def rest(
 @app.command("clear")
 def clear(
     system: options.System,
-    yes: Annotated[bool, typer.Option("--yes", help="The cause has been seen to; do not ask.")] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="The cause is fixed; do not ask.")] = False,
     set: options.Set = None,
     seed: options.Seed = None,
     mode: options.Mode = None,
     json: options.Json = False,
 ) -> None:
-    """End a latched fault, once an operator has seen to its cause; the shell is at rest afterwards."""
+    """Clear a latched fault after its cause is fixed; the shell is at rest afterwards."""
     with command_context("asm clear", json=json) as context:
         from escape_hw.errors import ConfigError
 
@@ -89,8 +91,8 @@ def clear(
         previous = mirror.observe_health()
         if previous.state == "fault" and not yes:
             context.notify(f"fault: {previous.fault}")
-            if json or not sys.stdin.isatty() or not typer.confirm("Has its cause been seen to?", err=True):
-                raise ConfigError("nothing was cleared; see to the cause, then say so with --yes")
+            if json or not sys.stdin.isatty() or not typer.confirm("Is its cause fixed?", err=True):
+                raise ConfigError("the fault was not cleared; fix its cause, then confirm with --yes")
         if previous.state == "fault":
             announce_change(context, config, "dm", f"clear the fault '{previous.fault}'")
             with open_device(context, mirror):
@@ -102,7 +104,7 @@ def clear(
         changed = after is not previous
         report_device_result(
             context, "asm clear", config, mirror.info.simulated, changed,
-            previous=previous.state, fault=previous.fault, after=after.state,
+            before=previous.state, fault=previous.fault, after=after.state,
         )  # fmt: skip
 
 
@@ -114,12 +116,12 @@ def _secondary(
     Raises
     ------
     ConfigError
-        Its mirror is none.
+        The mirror is no adaptive secondary.
     """
     from escape_hw.api.adaptive_secondary import AdaptiveSecondary
 
     config, mirror = build_single_device(context, selection, "dm", AdaptiveSecondary)  # type: ignore[type-abstract]
-    # Nothing rises because somebody asks or clears.
+    # A query, or clearing a fault, must not lift the shell.
     mirror.lift = False
     return config, mirror
 
@@ -127,7 +129,7 @@ def _secondary(
 def _go_to_state(
     context: CommandContext, selection: options.SystemSelection, command: str, *, floating: bool
 ) -> None:
-    """Lead the mirror to a state and leave it there."""
+    """Bring the mirror to a state and leave it there."""
     from escape_hw.api.adaptive_secondary import ShellState
 
     config, mirror = _secondary(context, selection)
@@ -142,12 +144,11 @@ def _go_to_state(
     context.show(f"{previous} → {health.state}", *_format_health(health))
     report_device_result(
         context, command, config, mirror.info.simulated, previous is not health.state,
-        previous=previous, after=health.state, health=asdict(health),
+        before=previous, after=health.state, health=asdict(health),
     )  # fmt: skip
 
 
 def _format_health(health: ShellHealth) -> list[str]:
-    """Health for people."""
     lines = [
         f"{health.state}: gap {health.gap_m * 1e6:.1f} um, largest current {health.current_a:.3g} A, "
         f"{health.temperature_c:.1f} °C, {health.skipped} commands skipped"

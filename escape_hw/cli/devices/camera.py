@@ -1,4 +1,4 @@
-"""``escape camera``: hands on a camera, without any calibration."""
+"""``escape camera``: record, monitor and configure a camera."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ if TYPE_CHECKING:
     from escape_hw.config.system import SystemConfig
 
 app = typer.Typer(
-    help="Take frames from a camera, watch it or set it, on twin and metal.", no_args_is_help=True
+    help="Record frames of a camera, monitor or configure it; simulated or real.", no_args_is_help=True
 )
 Which = Annotated[
-    Literal["wfs", "science"], typer.Option("--camera", help="The wavefront sensor's or the science camera.")
+    Literal["wfs", "science"], typer.Option("--camera", help="Wavefront sensor or science camera.")
 ]
 
 
@@ -34,7 +34,7 @@ Which = Annotated[
 def snap(
     system: options.System,
     camera: Which = "wfs",
-    frames: Annotated[int, typer.Option("--frames", min=1, max=100000, help="How many.")] = 1,
+    frames: Annotated[int, typer.Option("--frames", min=1, max=100000, help="Number of frames.")] = 1,
     out: Annotated[
         Path | None, typer.Option("--out", metavar="FILE", help="FITS file (default: nothing is written).")
     ] = None,
@@ -44,7 +44,7 @@ def snap(
     json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Take frames with the settings of the configuration."""
+    """Record frames with the settings of the configuration."""
     with command_context("camera snap", json=json, quiet=quiet) as context:
         import numpy as np
 
@@ -55,7 +55,7 @@ def snap(
             context, options.SystemSelection.of(system, set, seed, mode), camera
         )
         if out is not None and out.exists():
-            raise ConfigError(f"{out}: exists already; choose another name or remove it first")
+            raise ConfigError(f"{out}: exists; choose another name or remove it")
         with open_device(context, device):
             settings, changed = _apply_configuration(context, config, camera, device)
             frame_list = context.run(grab_frames(device, frames, section.timeout_s))
@@ -66,9 +66,9 @@ def snap(
         counts = {"min": int(cube.min()), "max": int(cube.max()), "mean": float(cube.mean())}
         saturated = max(frame.n_saturated for frame in frame_list)
         context.show(
-            f"{info.model} {info.serial}: {len(frame_list)} frames of {cube.shape[2]} x {cube.shape[1]} pixels, "
-            f"{status.lost} lost, counts {counts['min']} to {counts['max']}, mean {counts['mean']:.1f}, "
-            f"{saturated} saturated",
+            f"{info.model} {info.serial}: {len(frame_list)} frames of {cube.shape[2]} x {cube.shape[1]} "
+            f"pixels, {status.lost} lost, counts {counts['min']} to {counts['max']}, "
+            f"mean {counts['mean']:.1f}, {saturated} saturated",
             *([f"written: {out}"] if out is not None else []),
         )
         report_device_result(
@@ -82,29 +82,30 @@ def snap(
 def stream(
     system: options.System,
     camera: Which = "wfs",
-    seconds: Annotated[float, typer.Option("--seconds", min=0.01, max=86400, help="How long.")] = 1.0,
+    seconds: Annotated[float, typer.Option("--seconds", min=0.01, max=86400, help="Duration.")] = 1.0,
     set: options.Set = None,
     seed: options.Seed = None,
     mode: options.Mode = None,
     json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Watch a camera run: rate, lost frames, counts. Exit code 1 when frames were lost."""
+    """Monitor a running camera: rate, lost frames, counts. Exit code 1 when frames were lost."""
     with command_context("camera stream", json=json, quiet=quiet) as context:
-        from escape_hw.runtime.host.device_tools import monitor_camera as watch
+        from escape_hw.runtime.host.device_tools import monitor_camera
 
         config, section, device = _camera(
             context, options.SystemSelection.of(system, set, seed, mode), camera
         )
         with open_device(context, device):
             settings, changed = _apply_configuration(context, config, camera, device)
-            statistics = context.run(watch(device, seconds, section.timeout_s))
+            statistics = context.run(monitor_camera(device, seconds, section.timeout_s))
             info = device.info
         context.show(
             f"{info.model} {info.serial}: {statistics.frames} frames at {statistics.rate_hz:.2f} Hz "
-            f"(asked {settings.frame_rate_hz:.2f}), {statistics.status.lost} lost, "
+            f"(requested {settings.frame_rate_hz:.2f}), {statistics.status.lost} lost, "
             f"{statistics.status.timeouts} time-outs",
-            f"counts {statistics.lowest} to {statistics.highest}, mean {statistics.mean:.1f}, {statistics.saturated} saturated",
+            f"counts {statistics.lowest} to {statistics.highest}, mean {statistics.mean:.1f}, "
+            f"{statistics.saturated} saturated",
         )
         report_device_result(
             context, "camera stream", config, info.simulated, changed,
@@ -123,13 +124,15 @@ def settings(
     region: Annotated[
         str | None, typer.Option("--region", metavar="X,Y,WIDTH,HEIGHT", help="Region read, pixels.")
     ] = None,
-    check: Annotated[bool, typer.Option("--check", help="Only tell what would be; set nothing.")] = False,
+    check: Annotated[
+        bool, typer.Option("--check", help="Only check what the camera can do; set nothing.")
+    ] = False,
     set: options.Set = None,
     seed: options.Seed = None,
     mode: options.Mode = None,
     json: options.Json = False,
 ) -> None:
-    """Check settings, then set them: tells what the camera makes of them, as TOML to paste."""
+    """Check settings, then set them; shows the settings in force, as TOML to paste."""
     with command_context("camera settings", json=json) as context:
         config, section, device = _camera(
             context, options.SystemSelection.of(system, set, seed, mode), camera
@@ -143,7 +146,7 @@ def settings(
             info = device.info
         context.show(f"[devices.{camera}]", *_format_toml(now))
         if now != requested:
-            context.notify(f"asked: {requested}")
+            context.notify(f"requested: {requested}")
         report_device_result(
             context, "camera settings", config, info.simulated, not check,
             camera=camera, asked=asdict(requested), settings=asdict(now), as_asked=now == requested,
@@ -163,7 +166,7 @@ def _camera(
 def _apply_configuration(
     context: CommandContext, config: SystemConfig, key: str, device: Camera
 ) -> tuple[CameraSettings, bool]:
-    """Give the open camera the settings of its section; what is in force, and whether that is a change."""
+    """Apply the configuration to the open camera; the settings in force, and whether they changed."""
     before, requested = device.settings, getattr(config.devices, key).settings()
     if before == requested:
         return before, False
@@ -174,12 +177,12 @@ def _apply_configuration(
 def _requested_settings(
     base: CameraSettings, exposure: float | None, rate: float | None, gain: float | None, region: str | None
 ) -> CameraSettings:
-    """The configured settings with those asked for.
+    """The configured settings with the options applied.
 
     Raises
     ------
     ConfigError
-        The region is not four whole numbers.
+        The region is not four integers.
     """
     from escape_hw.api.camera import Region
     from escape_hw.errors import ConfigError
@@ -187,7 +190,7 @@ def _requested_settings(
     if region is not None:
         parts = region.split(",")
         if len(parts) != 4 or not all(part.strip().isdigit() for part in parts):
-            raise ConfigError(f"--region {region}: write X,Y,WIDTH,HEIGHT in whole pixels")
+            raise ConfigError(f"--region {region}: write X,Y,WIDTH,HEIGHT in integer pixels")
         base = replace(base, region=Region(*map(int, parts)))
     return replace(
         base,

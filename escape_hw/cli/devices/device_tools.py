@@ -1,4 +1,4 @@
-"""What the commands for single devices share: the device alone, and a word before it changes."""
+"""Shared parts of the commands for single devices."""
 
 from __future__ import annotations
 
@@ -16,23 +16,18 @@ if TYPE_CHECKING:
 D = TypeVar("D", bound="Device")
 
 
-def is_on_hardware(config: SystemConfig, key: str) -> bool:
-    """True when this device of the system is a real one."""
+def announce_change(context: CommandContext, config: SystemConfig, key: str, what: str) -> None:
+    """Announce how a real device is about to change; nothing for a simulated one."""
     from escape_hw.bench import resolve_mode
 
-    return resolve_mode(getattr(config.devices, key), config) == "hardware"
-
-
-def announce_change(context: CommandContext, config: SystemConfig, key: str, what: str) -> None:
-    """Say before it happens that a real device is about to change, and how."""
-    if is_on_hardware(config, key):
-        serial = getattr(config.devices, key).serial
-        context.notify(f"this changes hardware, devices.{key} {serial}: {what}")
+    section = getattr(config.devices, key)
+    if resolve_mode(section, config) == "hardware":
+        context.notify(f"this changes hardware, devices.{key} {section.serial}: {what}")
 
 
 @contextmanager
 def open_device(context: CommandContext, device: D) -> Iterator[D]:
-    """The device, open; closed at the end whatever happens, and no Ctrl-C breaks into that."""
+    """Open a device, and close it at the end; a Ctrl-C does not interrupt the closing."""
     context.devices_opened = True
     try:
         with device:
@@ -47,7 +42,7 @@ def open_device(context: CommandContext, device: D) -> Iterator[D]:
 def report_device_result(
     context: CommandContext, command: str, config: SystemConfig, simulated: bool, changed: bool, **rest: Any
 ) -> None:
-    """The command's document."""
+    """Set the command's document."""
     from escape_hw.io.documents import header_fields
 
     start = header_fields(command, config.system.name, simulated, config.system.seed)

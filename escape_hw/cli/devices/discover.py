@@ -14,11 +14,11 @@ from escape_hw.cli.context import command_context
 def discover(
     host: Annotated[
         list[str] | None,
-        typer.Option("--host", metavar="NAME[:PORT]", help="Ask there for devices, too; repeatable."),
+        typer.Option("--host", metavar="NAME[:PORT]", help="Query this host, too; repeatable."),
     ] = None,
     json: options.Json = False,
 ) -> None:
-    """Find devices without opening them, with what to paste into the system's file.
+    """Find devices without opening them, with their sections for the system's file.
 
     Exit code 1: none was found.
     """
@@ -34,7 +34,7 @@ def discover(
             context.show(device.toml, "")
         if not found:
             context.notify(
-                "no device was found; see 'escape doctor' for permissions, and name hosts with --host"
+                "no device was found; check permissions with 'escape doctor', name network hosts with --host"
             )
         devices = [asdict(device) for device in found]
         context.result({**header_fields("discover", None, None, None), "devices": devices}, met=bool(found))

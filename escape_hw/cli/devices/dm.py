@@ -1,4 +1,4 @@
-"""``escape dm``: hands on the deformable mirror, without any calibration."""
+"""``escape dm``: flatten, poke and query the deformable mirror."""
 
 from __future__ import annotations
 
@@ -21,8 +21,10 @@ if TYPE_CHECKING:
     from escape_hw.config.system import SystemConfig
     from escape_hw.runtime.host.device_tools import DriveResult
 
-app = typer.Typer(help="Flatten, poke or ask the deformable mirror, on twin and metal.", no_args_is_help=True)
-Seconds = Annotated[float, typer.Option("--seconds", min=0, max=3600, help="How long; flat afterwards.")]
+app = typer.Typer(
+    help="Flatten, poke or query the deformable mirror; simulated or real.", no_args_is_help=True
+)
+Seconds = Annotated[float, typer.Option("--seconds", min=0, max=3600, help="Duration; flat afterwards.")]
 
 
 @app.command("flat")
@@ -45,7 +47,7 @@ def flat(
         report_device_result(context, "dm flat", config, info.simulated, True, commands=sent)
 
 
-# Without it a negative amplitude would be taken for an option.
+# Otherwise a negative amplitude is parsed as an option.
 @app.command("poke", context_settings={"ignore_unknown_options": True})
 def poke(
     system: options.System,
@@ -58,7 +60,7 @@ def poke(
     json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Move one actuator for a while: MOVES the mirror, flat before and after."""
+    """Poke one actuator for a while: MOVES the mirror, flat before and after."""
     with command_context("dm poke", json=json, quiet=quiet) as context:
         config, dm = _mirror(context, options.SystemSelection.of(system, set, seed, mode))
         _require_actuator(config, actuator, amplitude)
@@ -90,10 +92,9 @@ def wave(
     json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Let a wave run over the mirror: MOVES every actuator, flat before and after."""
+    """Run a wave over the mirror: MOVES every actuator, flat before and after."""
     with command_context("dm wave", json=json, quiet=quiet) as context:
-        from escape_hw.runtime.host.device_tools import run_wave as running
-        from escape_hw.runtime.host.device_tools import wave_generator
+        from escape_hw.runtime.host.device_tools import run_wave, wave_generator
 
         config, dm = _mirror(context, options.SystemSelection.of(system, set, seed, mode))
         announce_change(
@@ -102,7 +103,7 @@ def wave(
         _preserve_floating(dm)
         with open_device(context, dm):
             dm.flatten()
-            motion = context.run(running(dm, wave_generator(dm, amplitude, waves), frequency, seconds))
+            motion = context.run(run_wave(dm, wave_generator(dm, amplitude, waves), frequency, seconds))
             info = dm.info
         asked = {"amplitude": amplitude, "frequency_hz": frequency, "waves": waves, "seconds": seconds}
         context.show(
@@ -119,9 +120,9 @@ def status(
     mode: options.Mode = None,
     json: options.Json = False,
 ) -> None:
-    """Tell what the mirror is and what it may do; an adaptive secondary is only looked at.
+    """Show properties and limits of the mirror.
 
-    Any other mirror has to be opened for it, and is left flat when it is closed.
+    An adaptive secondary is only observed. Any other mirror is opened, and flat when it is closed.
     """
     with command_context("dm status", json=json) as context:
         from escape_hw.api.adaptive_secondary import AdaptiveSecondary
@@ -134,11 +135,10 @@ def status(
             rest["health"], changed = asdict(health), False
             context.show(f"{health.state}, gap {health.gap_m * 1e6:.1f} um {health.fault}".rstrip())
         else:
-            announce_change(context, config, "dm", "it is opened, and flat when it is closed")
+            announce_change(context, config, "dm", "it is opened, and flattened when it is closed")
             with open_device(context, dm):
                 changed = True
-        info = dm.info
-        limits = dm.limits
+        info, limits = dm.info, dm.limits
         context.show(
             f"{info.model} {info.serial}: {info.n_act} actuators, full stroke {info.stroke_m * 1e6:g} um"
         )
@@ -159,7 +159,7 @@ def _mirror(
 
 
 def _preserve_floating(dm: DeformableMirror) -> None:
-    """Have a shell that floats already float afterwards, too; any other is rested again."""
+    """Leave a shell that floats afloat after the command; any other is rested again."""
     from escape_hw.api.adaptive_secondary import AdaptiveSecondary, ShellState
 
     if isinstance(dm, AdaptiveSecondary):
@@ -167,23 +167,23 @@ def _preserve_floating(dm: DeformableMirror) -> None:
 
 
 def _require_actuator(config: SystemConfig, actuator: int, amplitude: float) -> None:
-    """Refuse what cannot be, before anything is opened.
+    """Check the poke before anything is opened.
 
     Raises
     ------
     ConfigError
-        No such actuator, one that is out of service, or a poke beyond the stroke.
+        The actuator does not exist or is disabled, or the poke exceeds the stroke.
     """
     from escape_hw.errors import ConfigError
 
     section = config.devices.dm
     if actuator >= section.n_act:
-        raise ConfigError(f"actuator {actuator}: the mirror's are numbered 0 to {section.n_act - 1}")
+        raise ConfigError(f"actuator {actuator}: does not exist; the mirror has 0 to {section.n_act - 1}")
     if actuator in section.limits.disabled:
-        raise ConfigError(f"actuator {actuator}: out of service (devices.dm.limits.disabled)")
+        raise ConfigError(f"actuator {actuator}: disabled (devices.dm.limits.disabled)")
     if not abs(amplitude) <= section.limits.max_stroke:
         raise ConfigError(
-            f"amplitude {amplitude:g}: devices.dm.limits.max_stroke is {section.limits.max_stroke}"
+            f"amplitude {amplitude:g}: exceeds devices.dm.limits.max_stroke, {section.limits.max_stroke}"
         )
 
 

@@ -1,4 +1,4 @@
-"""``escape emulate``: answers on a device's own wire, for its driver to be tried on without the device."""
+"""``escape emulate``: emulate a device on its own interface, to test its driver without the device."""
 
 from __future__ import annotations
 
@@ -18,23 +18,23 @@ _POLL_S = 0.2
 
 
 def emulate(
-    name: Annotated[str, typer.Argument(help="Device, such as e727; without one: the list.")] = "",
+    name: Annotated[str, typer.Argument(help="Device, such as e727; without one, lists them.")] = "",
     host: Annotated[str, typer.Option("--host", help="Network interface to listen on.")] = "127.0.0.1",
     port: Annotated[
         int | None,
         typer.Option("--port", min=0, max=65535, help="TCP port (default: the device's; 0: any free)."),
     ] = None,
-    pty: Annotated[bool, typer.Option("--pty", help="On a pseudo-terminal instead of the network.")] = False,
+    pty: Annotated[bool, typer.Option("--pty", help="Use a pseudo-terminal instead of the network.")] = False,
     option: Annotated[
         list[str] | None,
         typer.Option("--option", metavar="KEY=VALUE", help="Setting of this emulator; repeatable."),
     ] = None,
     seconds: Annotated[
-        float | None, typer.Option("--seconds", min=0, help="Stop after so long (default: at Ctrl-C).")
+        float | None, typer.Option("--seconds", min=0, help="Stop after this time (default: at Ctrl-C).")
     ] = None,
     json: options.Json = False,
 ) -> None:
-    """Stand in for a device on its own wire until Ctrl-C; tells what a client did wrong (exit code 1)."""
+    """Emulate a device on its own interface until Ctrl-C; reports errors of clients (exit code 1)."""
     with command_context("emulate", json=json) as context:
         from escape_hw.api.emulator import EmulatorRequest
         from escape_hw.config.registry import EMULATORS, available, emulator_factory
@@ -53,7 +53,6 @@ def emulate(
 
 
 def _parse_option(text: str) -> tuple[str, str]:
-    """``KEY=VALUE`` as a pair."""
     from escape_hw.errors import ConfigError
 
     key, equals, value = text.partition("=")
@@ -63,7 +62,7 @@ def _parse_option(text: str) -> tuple[str, str]:
 
 
 def _serve(context: CommandContext, name: str, emulator: Emulator, seconds: float | None) -> dict[str, Any]:
-    """Run an emulator until its time is over or somebody stops it; returns what there is to tell."""
+    """Run an emulator until its time is over or Ctrl-C; returns its part of the document."""
     deadline = None if seconds is None else time.monotonic() + seconds
     n_reported = 0
     address = emulator.start()

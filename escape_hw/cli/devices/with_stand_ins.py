@@ -1,4 +1,4 @@
-"""``escape with_stand_ins``: everything as on the metal, with the real drivers, on the simulated bench."""
+"""``escape with-stand-ins``: the real drivers on a simulated bench, with stand-ins for vendor libraries."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from escape_hw.api.emulator import StandInBench
 
 _ESCAPE = (sys.executable, "-c", "from escape_hw.cli import main; main()")
-#: What a shell says of a command that is not there.
+#: A shell's exit code for a command that is not found.
 _NOT_FOUND = 127
 
 
@@ -28,42 +28,42 @@ def with_stand_ins(
     system: options.System,
     command: Annotated[
         list[str] | None,
-        typer.Argument(help="Command to run meanwhile, after '--'; without one: until Ctrl-C."),
+        typer.Argument(help="Command to run, after '--'; without one, runs until Ctrl-C."),
     ] = None,
     set: options.Set = None,
     seed: options.Seed = None,
     json: options.Json = False,
 ) -> None:
-    """Simulate the bench behind the real drivers, through stand-ins of their vendors' libraries.
+    """Run the real drivers on a simulated bench, with stand-ins for the vendor libraries.
 
-    escape rehearse razor-shwfs -- escape calibrate razor-shwfs --mode hardware
+    escape with-stand-ins razor-shwfs -- escape calibrate razor-shwfs --mode hardware
     """
-    with command_context("rehearse", json=json) as context:
+    with command_context("with-stand-ins", json=json) as context:
         from escape_hw.config.registry import stand_in_bench_factory
         from escape_hw.io.documents import header_fields
 
         selection = options.SystemSelection.of(system, set, seed, None)
         config = context.load_config(selection)
-        rehearsal = stand_in_bench_factory()(config)
-        rehearsal.start()
+        stand_ins = stand_in_bench_factory()(config)
+        stand_ins.start()
         try:
             if command:
-                context.code = _run(context, command, rehearsal.environment)
+                context.code = _run(context, command, stand_ins.environment)
                 return
-            environment = dict(rehearsal.environment)
+            environment = dict(stand_ins.environment)
             context.show(*(f"export {key}={shlex.quote(value)}" for key, value in environment.items()))
-            document = header_fields("rehearse", config.system.name, True, config.system.seed)
+            document = header_fields("with-stand-ins", config.system.name, True, config.system.seed)
             context.result({**document, "environment": environment})
-            # Whoever reads the document waits for it, and not for the end.
+            # A reader of the document must not wait for the end.
             context.print_document()
-            _until_stopped(context, rehearsal)
+            _until_stopped(context, stand_ins)
         finally:
-            rehearsal.stop()
+            stand_ins.stop()
 
 
 def _run(context: CommandContext, command: Sequence[str], environment: Mapping[str, str]) -> int:
-    """Run a command to its end; a Ctrl-C is its business, for its mirror must become flat."""
-    # The very program that runs, also where its folder is not on the path.
+    """Run a command to its end; it handles a Ctrl-C itself, to flatten its mirror."""
+    # This program, also where its folder is not on the path.
     words = [*_ESCAPE, *command[1:]] if command[0] == "escape" else command
     try:
         child = subprocess.Popen(words, env={**os.environ, **environment})
@@ -72,21 +72,21 @@ def _run(context: CommandContext, command: Sequence[str], environment: Mapping[s
         return _NOT_FOUND
     while True:
         try:
-            # Its end is looked at, not taken: a Ctrl-C in this very moment would lose its exit code.
+            # The exit code is not consumed: a Ctrl-C at this moment would lose it.
             end = os.waitid(os.P_PID, child.pid, os.WEXITED | os.WNOWAIT)
             break
         except KeyboardInterrupt:
-            context.notify("rehearse: waiting for the command to end")
+            context.notify("with-stand-ins: waiting for the command to end")
     with contextlib.suppress(KeyboardInterrupt):
         child.wait()
     if end is None:
-        raise RuntimeError("the command's end was not told")
+        raise RuntimeError("the command ended without an exit code")
     return end.si_status if end.si_code == os.CLD_EXITED else 128 + end.si_status
 
 
-def _until_stopped(context: CommandContext, rehearsal: StandInBench) -> None:
-    context.notify("rehearse: the bench answers as long as this runs; Ctrl-C ends it")
+def _until_stopped(context: CommandContext, stand_ins: StandInBench) -> None:
+    context.notify("with-stand-ins: the bench is available while this runs; stop it with Ctrl-C")
     try:
         threading.Event().wait()
     except KeyboardInterrupt:
-        context.notify("rehearse: stopped")
+        context.notify("with-stand-ins: stopped")

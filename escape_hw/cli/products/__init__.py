@@ -1,1 +1,1 @@
-"""Commands that show, compare, report, export or import files. The file formats are in escape_hw.io."""
+"""Commands that show, compare, report, export or import files. The formats are in :mod:`escape_hw.io`."""

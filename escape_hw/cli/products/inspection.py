@@ -53,7 +53,7 @@ def _show_run(context: CommandContext, folder: Path) -> None:
     document = run.document
     context.show(f"{document['command']} on {document['system']}", status_line(run.simulated, run.partial()))
     if run.estimates():
-        context.show(rich_table(registration_table(run.estimates(), run.planted)))
+        context.show(rich_table(registration_table(run.estimates(), run.injected)))
     for gains in run.gains.values():
         context.show(rich_table(rounds_table(gains)))
     if run.loops:
@@ -91,7 +91,7 @@ def compare(
 def _optical_gains(
     context: CommandContext, a: InteractionMatrix, b: InteractionMatrix
 ) -> dict[str, Any] | None:
-    """Gains of B relative to A, by the paper's ratio of deviations and by the unbiased projection."""
+    """Gains of B relative to A, by the paper's ratio of deviations and by an unbiased projection."""
     from escape_hw.calibration.optical_gain.matrix_comparison import deviation_ratio, projection
     from escape_hw.errors import CalibrationError
 
@@ -111,11 +111,11 @@ def _optical_gains(
 def report(
     run: Annotated[Path, typer.Argument(help="Folder of a run.")],
     picture: Annotated[
-        Path | None, typer.Option("--picture", metavar="FILE", help="Draw matrices and images as PNG, too.")
+        Path | None, typer.Option("--picture", metavar="FILE", help="Also draw matrices and images as PNG.")
     ] = None,
     json: options.Json = False,
 ) -> None:
-    """Build report.html of a run again from its products."""
+    """Build the report of a run again from its products."""
     with command_context("report", json=json) as context:
         from escape_hw.io.documents import header_fields
         from escape_hw.io.run_folder import read_result

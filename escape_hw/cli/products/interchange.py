@@ -1,4 +1,4 @@
-"""``escape export`` and ``escape import``: files and streams of other adaptive-optics software."""
+"""``escape export`` and ``escape import``: files and streams of pyRTC, AOT and milk."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ if TYPE_CHECKING:
     from escape_hw.io.fits.matrix import MatrixProduct
     from escape_hw.io.interchange.stream import Stream
 
-export_app = typer.Typer(help="Write what other software reads: pyRTC, AOT, milk.", no_args_is_help=True)
-import_app = typer.Typer(help="Read what other software wrote: pyRTC, AOT, milk.", no_args_is_help=True)
+export_app = typer.Typer(help="Write files of other software: pyRTC, AOT, milk.", no_args_is_help=True)
+import_app = typer.Typer(help="Read files of other software: pyRTC, AOT, milk.", no_args_is_help=True)
 
 _Product = Annotated[Path, typer.Argument(metavar="IM", help="Interaction matrix (FITS).")]
 _OutFile = Annotated[Path, typer.Option("--out", metavar="FILE", help="Product to write (FITS).")]
-_Frames = Annotated[int, typer.Option("--frames", min=1, help="How many arrays.")]
+_Frames = Annotated[int, typer.Option("--frames", min=1, help="Number of arrays.")]
 _Arrays = Annotated[Path, typer.Option("--out", metavar="FILE", help="Arrays to write (.npz).")]
 #: Longest wait for the next array of a stream, in seconds.
-_PATIENCE_S = 10.0
+_TIMEOUT_S = 10.0
 
 
 @export_app.command("pyrtc")
@@ -39,7 +39,7 @@ def export_pyrtc(
     ] = None,
     json: options.Json = False,
 ) -> None:
-    """Write a matrix as pyRTC 2.x reads it, with mask, references, modes and settings."""
+    """Write a matrix for pyRTC 2.x, with mask, references, modes and settings."""
     with command_context("export pyrtc", json=json) as context:
         import numpy as np
 
@@ -49,7 +49,7 @@ def export_pyrtc(
         from escape_hw.io.interchange.pyrtc.files import read_file
 
         if commands and modes is not None:
-            raise ConfigError("--commands and --modes: the matrix can be for one of them only")
+            raise ConfigError("--commands and --modes: choose one of them")
         product = load_matrix(im)
         system_config = _system_config(product)
         wanted = None if modes is None else np.asarray(read_file(modes).data, float)
@@ -72,7 +72,7 @@ def export_aot(
     ] = None,
     json: options.Json = False,
 ) -> None:
-    """Write a matrix, and a loop's telemetry beside it, in the AOT standard (needs aotpy)."""
+    """Write a matrix, and telemetry of a loop, in the AOT standard (needs aotpy)."""
     with command_context("export aot", json=json) as context:
         from escape_hw.io.fits.matrix import load_matrix
         from escape_hw.io.fits.telemetry import load_telemetry
@@ -94,11 +94,9 @@ def export_aot(
 @export_app.command("milk")
 def export_milk(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="Interaction matrix (FITS) or array (.npy).")],
-    name: Annotated[
-        str, typer.Argument(metavar="NAME", help="Of the image, or what their names begin with.")
-    ],
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Name of the image, or prefix of the names.")],
     version: Annotated[
-        str, typer.Option("--layout", metavar="VERSION", help="Version of ImageStreamIO that is to read it.")
+        str, typer.Option("--layout", metavar="VERSION", help="Version of ImageStreamIO of the reader.")
     ] = "2.00",
     json: options.Json = False,
 ) -> None:
@@ -136,13 +134,13 @@ def import_pyrtc(
     ] = None,
     legacy: Annotated[
         str | None,
-        typer.Option("--legacy", help="How files of pyRTC 1.x were made: yx, xy or as_is."),
+        typer.Option("--legacy", help="Axis order of files of pyRTC 1.x: yx, xy or as_is."),
     ] = None,
     set: options.Set = None,
     mode: options.Mode = None,
     json: options.Json = False,
 ) -> None:
-    """Read the matrix that a configuration of pyRTC's names, for a system of ours."""
+    """Read the matrix of a pyRTC configuration as a product of a system."""
     with command_context("import pyrtc", json=json) as context:
         from escape_hw.io.interchange.pyrtc.calibration import PyrtcConfig, TargetSystem, import_matrix
 
@@ -160,9 +158,9 @@ def import_aot(
     system: options.System,
     out: _OutFile,
     telemetry: Annotated[
-        Path | None, typer.Option("--telemetry", metavar="FILE", help="Write its telemetry, too (FITS).")
+        Path | None, typer.Option("--telemetry", metavar="FILE", help="Also write its telemetry (FITS).")
     ] = None,
-    loop: Annotated[str, typer.Option("--loop", help="Which of its loops (default: the only one).")] = "",
+    loop: Annotated[str, typer.Option("--loop", help="Name of the loop (default: the only one).")] = "",
     stroke: Annotated[
         float | None, typer.Option("--stroke", help="Metres of surface for a command of 1.")
     ] = None,
@@ -170,7 +168,7 @@ def import_aot(
     mode: options.Mode = None,
     json: options.Json = False,
 ) -> None:
-    """Read a matrix, and telemetry, of an AOT file for a system of ours (needs aotpy)."""
+    """Read a matrix, and telemetry, of an AOT file as products of a system (needs aotpy)."""
     with command_context("import aot", json=json) as context:
         from dataclasses import replace
 
@@ -194,18 +192,18 @@ def import_aot(
         if telemetry is not None and content.telemetry is not None:
             save_telemetry(telemetry, content.telemetry, ours.system.name, simulated, config_provenance(ours))
         elif telemetry is not None:
-            raise IncompatibleProduct(f"{file}: holds no measurements and commands that go together")
+            raise IncompatibleProduct(f"{file}: has no measurements with matching commands")
         _save_import(context, "import aot", out, replace(found, matrix=matrix), ours, file, telemetry)
 
 
 @import_app.command("milk")
 def import_milk(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="Of the shared-memory image.")],
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Name of the shared-memory image.")],
     out: _Arrays,
     frames: _Frames = 1,
     json: options.Json = False,
 ) -> None:
-    """Read arrays of a shared-memory image of milk's."""
+    """Read arrays of a shared-memory image of milk."""
     with command_context("import milk", json=json) as context:
         from escape_hw.io.interchange.milk.stream import MilkStream
 
@@ -214,12 +212,12 @@ def import_milk(
 
 @import_app.command("pyrtc-stream")
 def import_pyrtc_stream(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="Of the stream.")],
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Name of the stream.")],
     out: _Arrays,
     frames: _Frames = 1,
     json: options.Json = False,
 ) -> None:
-    """Read arrays of a running pyRTC's stream (needs pyshmem)."""
+    """Read arrays of a stream of a running pyRTC (needs pyshmem)."""
     with command_context("import pyrtc-stream", json=json) as context:
         from escape_hw.io.interchange.pyrtc.stream import ShmemStream
 
@@ -227,20 +225,18 @@ def import_pyrtc_stream(
 
 
 def _system_config(product: MatrixProduct) -> SystemConfig:
-    """The configuration that a product carries.
+    """The configuration stored in a product.
 
     Raises
     ------
     IncompatibleProduct
-        It carries none.
+        There is none.
     """
     from escape_hw.config.loader import load_text
     from escape_hw.errors import IncompatibleProduct
 
     if not product.config_text.strip():
-        raise IncompatibleProduct(
-            f"{product.path}: carries no configuration; calibrate again with this version"
-        )
+        raise IncompatibleProduct(f"{product.path}: has no configuration; calibrate again with this version")
     return load_text(product.config_text, str(product.path))
 
 
@@ -264,7 +260,7 @@ def _save_import(
     source: Path,
     telemetry: Path | None = None,
 ) -> None:
-    """Write a calibration that was read, with what it was read from as its parent."""
+    """Save an imported calibration, with its source as its parent."""
     from dataclasses import replace
 
     from escape_hw.cli.formatting import format_calibration, status_line
@@ -273,7 +269,7 @@ def _save_import(
     from escape_hw.io.provenance import file_sha256
     from escape_hw.runtime.session.record import config_provenance
 
-    # What its modes are, nobody here computed.
+    # The modes come from the file.
     origin = replace(config_provenance(config), basis="file", parents={source.name: file_sha256(source)})
     path = save_matrix(out, result, origin)
     context.show(
@@ -300,7 +296,7 @@ def _publish(name: str, data: Any, version: str) -> None:
 
 
 def _record_stream(context: CommandContext, command: str, stream: Stream, frames: int, out: Path) -> None:
-    """Arrays of a stream, the newest one and those that follow, as a file."""
+    """Save the newest array of a stream and those that follow."""
     import io
 
     import numpy as np
@@ -313,9 +309,9 @@ def _record_stream(context: CommandContext, command: str, stream: Stream, frames
     try:
         found = [stream.latest()]
         while len(found) < frames:
-            following = stream.read_after(found[-1].count, _PATIENCE_S)
+            following = stream.read_after(found[-1].count, _TIMEOUT_S)
             if following is None:
-                raise ProductError(f"stream '{stream.name}': nothing written for {_PATIENCE_S:g} s")
+                raise ProductError(f"stream '{stream.name}': nothing written for {_TIMEOUT_S:g} s")
             found.append(following)
     except StreamReadError as error:
         raise ProductError(str(error)) from error

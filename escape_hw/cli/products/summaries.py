@@ -1,4 +1,4 @@
-"""What ``escape show`` tells of a file, by the kind of product that it holds."""
+"""Summaries of products for ``escape show``, by kind."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from escape_hw.io.fits.run_state import KIND_STATE, load_state
 from escape_hw.io.fits.telemetry import KIND_TELEMETRY, load_telemetry
 from escape_hw.report.tables import registration_table, rounds_table, strehl_table
 
-#: What the document says of the product, and what the terminal shows of it.
+#: Fields of the document, and lines for the terminal.
 ProductSummary = tuple[dict[str, Any], list[RenderableType]]
 
 
@@ -32,11 +32,11 @@ def summarise_product(kind: str, file: Path) -> ProductSummary:
     Raises
     ------
     ProductError
-        The file is damaged, or of a kind that nobody here knows.
+        The file is damaged, or of an unknown kind.
     """
     summarise = _SUMMARIES.get(kind)
     if summarise is None:
-        raise ProductError(f"{file}: its kind is {kind!r}; known are {', '.join(sorted(_SUMMARIES))}")
+        raise ProductError(f"{file}: unknown kind {kind!r}; known are {', '.join(sorted(_SUMMARIES))}")
     return summarise(file)
 
 
@@ -90,17 +90,17 @@ def _frames(file: Path) -> ProductSummary:
         f"frame {result.index[0]} to {result.index[-1]} in {seconds:.6g} s, {result.lost_frames} lost; the "
         f"first exposure ended at {1e-9 * float(result.exposed_ns[0]):.6f} s of the camera's clock",
         f"counts {counts['min']} to {counts['max']}, mean {counts['mean']:.1f}, at most {saturated} pixels "
-        "of a frame saturated; as the camera delivered them: no dark subtracted, no flat divided",
+        "of a frame saturated; no dark subtracted, no flat divided",
     ]
 
 
 def _state(file: Path) -> ProductSummary:
     state = load_state(file)
     method, taken = str(state.identity.get("method")), state.values.get("taken")
-    way = f"escape calibrate --resume {shlex.quote(str(file.absolute().parent))}"
+    resume = f"escape calibrate --resume {shlex.quote(str(file.absolute().parent))}"
     frames = "" if taken is None else f" after {taken} frames"
-    document = {"method": method, "frames": taken, "request": state.values.get("request"), "resume": way}
-    return document, [f"a calibration by {method}, broken off{frames}", f"go on with: {way}"]
+    document = {"method": method, "frames": taken, "request": state.values.get("request"), "resume": resume}
+    return document, [f"a calibration by {method}, interrupted{frames}", f"resume with: {resume}"]
 
 
 _SUMMARIES: dict[str, Callable[[Path], ProductSummary]] = {

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import asdict
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from escape_hw.cli import options
 from escape_hw.cli.context import command_context
+
+if TYPE_CHECKING:
+    from escape_hw.runtime.host.doctor import Finding
 
 _SYMBOLS = {"ok": "✓", "info": "·", "warning": "!", "error": "✗"}
 
@@ -33,9 +36,14 @@ def doctor(
         findings = check_computer(config)
         for finding in findings:
             context.show(f"{_SYMBOLS[finding.level]} {finding.item}: {finding.text}")
-            if finding.way_out:
-                context.show(f"    → {finding.way_out}")
+            if finding.remedy:
+                context.show(f"    → {finding.remedy}")
         code = exit_code(findings)
         start = header_fields("doctor", system or None, None if config is None else config.simulated, None)
-        context.result({**start, "verdict": code, "findings": [asdict(finding) for finding in findings]})
+        context.result({**start, "verdict": code, "findings": [_to_dict(one) for one in findings]})
         context.code = code
+
+
+def _to_dict(finding: Finding) -> dict[str, Any]:
+    """A finding for ``--json``; version 0.1.0 called the remedy ``way_out``."""
+    return {**asdict(finding), "way_out": finding.remedy}

@@ -19,7 +19,8 @@ def gui(
         ),
     ] = None,
     connect: Annotated[
-        str | None, typer.Option("--connect", metavar="ADDRESS", help="Connect to this server: tcp://HOST:PORT.")
+        str | None,
+        typer.Option("--connect", metavar="ADDRESS", help="Connect to this server: tcp://HOST:PORT."),
     ] = None,
     screenshot: Annotated[
         Path | None,

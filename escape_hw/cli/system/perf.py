@@ -23,13 +23,13 @@ if TYPE_CHECKING:
 
 #: Headings of a table of measurements; :func:`format_row` fills a row.
 COLUMNS = ("stage", "ours", "peer", "unit", "times better", "of floor", "peer is", "note")
-#: What is measured stands between these lines; what stands around them is prose and stays.
+#: Lines around the measured part of the page; the text outside stays.
 BEGIN, END = "<!-- measured: begin -->", "<!-- measured: end -->"
 _PACKAGES = ("escape-hw", "numpy", "scipy", "numba", "OOPAO", "pyrtcao", "specula", "synim")
 
 
 def measurement_conditions() -> dict[str, Any]:
-    """Machine, load and versions, plain for JSON."""
+    """Machine, load and versions, as JSON values."""
     versions: dict[str, str | None] = {}
     for name in _PACKAGES:
         try:
@@ -49,7 +49,7 @@ def measurement_conditions() -> dict[str, Any]:
 
 
 def _processor() -> str:
-    """The processor's name, where Linux tells it."""
+    """The processor's name."""
     try:
         text = Path("/proc/cpuinfo").read_text(encoding="utf-8")
     except OSError:
@@ -59,23 +59,23 @@ def _processor() -> str:
 
 
 def require_page(page: Path) -> None:
-    """Refuse a page that the table cannot be put into, before anything is measured.
+    """Check that the table can be written into a page.
 
     Raises
     ------
     ConfigError
-        The page exists without the two marks.
+        The page exists without the two marks, or its folder does not exist.
     """
     if page.exists():
         text = page.read_text(encoding="utf-8")
         if text.count(BEGIN) != 1 or text.count(END) != 1 or text.index(BEGIN) > text.index(END):
             raise ConfigError(f"{page} has no place for the table; put the lines {BEGIN} and {END} into it")
     elif not page.parent.is_dir():
-        raise ConfigError(f"{page.parent} is no folder; name a page in one that exists")
+        raise ConfigError(f"{page.parent} is no folder; name a page in an existing one")
 
 
 def write_page(page: Path, rows: Sequence[BenchmarkRow], at: dict[str, Any]) -> None:
-    """Put conditions and table between the marks of a page, or into a new one."""
+    """Write conditions and table between the marks of a page, or into a new page."""
     text = page.read_text(encoding="utf-8") if page.exists() else f"# Performance\n\n{BEGIN}\n{END}\n"
     before, rest = text.split(BEGIN)
     after = rest.split(END)[1]
@@ -83,7 +83,7 @@ def write_page(page: Path, rows: Sequence[BenchmarkRow], at: dict[str, Any]) -> 
 
 
 def format_row(row: BenchmarkRow) -> tuple[str, ...]:
-    """A measurement in words, by :data:`COLUMNS`."""
+    """The cells of a measurement, by :data:`COLUMNS`."""
     return (
         row.stage,
         f"{row.ours:.4g}",
@@ -166,10 +166,12 @@ def perf(
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document.")] = False,
     page: Annotated[
         Path | None,
-        typer.Option("--markdown", metavar="FILE", help="Write the table into this page, prose untouched."),
+        typer.Option(
+            "--markdown", metavar="FILE", help="Write the table into this page; its other text stays."
+        ),
     ] = None,
 ) -> None:
-    """Measure our speed and accuracy beside OOPAO's and pyRTC's, on one thread each."""
+    """Benchmark speed and accuracy beside OOPAO and pyRTC, on one thread each."""
     with command_context("perf", json=as_json) as context:
         if page is not None:
             require_page(page)

@@ -21,9 +21,7 @@ def serve(
     system: options.System,
     port: Annotated[
         int | None,
-        typer.Option(
-            "--port", min=1, max=65534, help="Listen on TCP as well; events use the next port."
-        ),
+        typer.Option("--port", min=1, max=65534, help="Listen on TCP as well; events use the next port."),
     ] = None,
     bind: Annotated[
         str, typer.Option("--bind", metavar="ADDRESS", help="Address for --port; others need 'escape keys'.")

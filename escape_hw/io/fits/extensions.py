@@ -207,7 +207,7 @@ def unpack_response(path: Path, hdus: fits.HDUList) -> TemporalResponse | None:
 
 def pack_registration(estimate: RegistrationEstimate) -> list[Any]:
     """Parameters with errors, their covariance, and the iterations that led there."""
-    rows = [*estimate.measured().values(), estimate.gain, estimate.width, *estimate.extras.values()]
+    rows = [*estimate.parameters().values(), estimate.gain, estimate.width, *estimate.extras.values()]
     alpha = fits_file.table_extension(
         "ALPHA",
         {

@@ -64,7 +64,7 @@ def save_gains(
         "notes": list(result.notes),
         "closure": [asdict(step) for step in result.closure],
         "rounds": [_round_scalars(one) for one in result.rounds],
-        "beside": {name: gains.common_sigma for name, gains in result.beside.items()},
+        "beside": {name: gains.common_sigma for name, gains in result.comparisons.items()},
     }
     hdus = [
         primary,
@@ -75,10 +75,10 @@ def save_gains(
         hdus.append(
             fits_file.image_extension("GAINS", np.stack([_vector_rows(one.gains) for one in result.rounds]))
         )
-    if result.beside:
+    if result.comparisons:
         hdus.append(
             fits_file.image_extension(
-                "BESIDE", np.stack([_vector_rows(one) for one in result.beside.values()])
+                "BESIDE", np.stack([_vector_rows(one) for one in result.comparisons.values()])
             )
         )
     fits_file.write(path, hdus)
@@ -150,7 +150,7 @@ def _unpack(path: Path, hdus: astropy_fits.HDUList, header: dict[str, Any]) -> G
         loop_gain=float(run["loop_gain"]),
         frames=int(run["frames"]),
         lost_frames=int(run["lost_frames"]),
-        beside={
+        comparisons={
             name: _gains_from_rows(rows, shared_sigma)
             for rows, (name, shared_sigma) in zip(others, beside.items(), strict=True)
         },

@@ -18,7 +18,7 @@ def optical_gains(result: GainsResult) -> Figure:
     Matrices whose gains lie below 1 (measured on a calmer beam than the loop's) are read on the left,
     those above 1 (measured in open loop) on the right, as in the paper.
     """
-    vectors = {METHOD_LABELS.get(result.method, result.method): result.gains, **result.beside}
+    vectors = {METHOD_LABELS.get(result.method, result.method): result.gains, **result.comparisons}
     known = {label: gains for label, gains in vectors.items() if gains is not None}
     figure = style.new_figure(7.8, 4.0)
     left = figure.subplots()

@@ -17,7 +17,7 @@ from escape_hw.report.tables import TITLES, format_with_error
 _SHORT_UNITS = {"% of Sub Aperture": "% sub-ap.", "deg": "deg", "% of Diameter": "% diam."}
 
 
-def convergence(estimate: RegistrationEstimate, planted: Registration | None = None) -> Figure:
+def convergence(estimate: RegistrationEstimate, injected: Registration | None = None) -> Figure:
     """Step norm above, the five parameters below, per iteration (paper: SPRINT convergence figure).
 
     The band is the final standard error around the final value, the dotted line the injected value.
@@ -38,14 +38,14 @@ def convergence(estimate: RegistrationEstimate, planted: Registration | None = N
         f"{state} after {len(steps)} iterations, reduced χ² {estimate.chi2:.3g}",
         loc="left", color=style.INK, fontsize=9.5,
     )  # fmt: skip
-    for panel, (name, value) in zip(panels[1:], estimate.measured().items(), strict=True):
+    for panel, (name, value) in zip(panels[1:], estimate.parameters().items(), strict=True):
         title, unit = TITLES[name]
         track = [getattr(step.registration, name) for step in steps]
         panel.plot(number, track, "o-", color=style.SERIES[2], ms=2.5, lw=1.3)
         low, high = value.value - value.sigma, value.value + value.sigma
         panel.axhspan(low, high, color=style.SERIES[1], alpha=0.35, lw=0)
-        if planted is not None:
-            panel.axhline(getattr(planted, name), color=style.INK, lw=1.0, ls=":")
+        if injected is not None:
+            panel.axhline(getattr(injected, name), color=style.INK, lw=1.0, ls=":")
         style.style_axes(panel).set_ylabel(f"{title}\n[{_SHORT_UNITS[unit]}]", fontsize=7.5)
         panel.margins(y=0.2)
         panel.yaxis.set_major_locator(MaxNLocator(3))

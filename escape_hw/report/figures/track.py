@@ -17,7 +17,7 @@ def track_figure(
     track: Mapping[str, Sequence[float | None]],
     exchanges: Sequence[Mapping[str, Any]],
     alarms: Sequence[Mapping[str, Any]],
-    planted: Mapping[str, Sequence[float]] | None = None,
+    injected: Mapping[str, Sequence[float]] | None = None,
 ) -> Figure:
     """Shift, rotation, optical gain and Strehl ratio (or residual) against time, with error bands.
 
@@ -27,7 +27,7 @@ def track_figure(
         Columns of the table, see :data:`~escape_hw.api.tracking.COLUMNS`.
     exchanges, alarms
         Their ``seconds`` are marked; of exchanges, those ``accepted``.
-    planted
+    injected
         True registration of a twin at the table's moments, by parameter.
     """
     columns = {name: np.array(values, float) for name, values in track.items()}
@@ -39,13 +39,13 @@ def track_figure(
         _draw_with_error(
             panels[0], t, columns[name] - median, columns[f"{name}_sigma"], colour, name.replace("_", " ")
         )
-        if planted is not None:
-            panels[0].plot(t, np.array(planted[name]) - median, ":", color=style.INK, lw=1.2)
+        if injected is not None:
+            panels[0].plot(t, np.array(injected[name]) - median, ":", color=style.INK, lw=1.2)
     style.style_axes(panels[0]).set_title("shift about its median [% of a sub-aperture]", fontsize=9.5)
     panels[0].legend(frameon=False, fontsize=8)
     _draw_with_error(panels[1], t, columns["rotation"], columns["rotation_sigma"], style.SERIES[0])
-    if planted is not None:
-        panels[1].plot(t, planted["rotation"], ":", color=style.INK, lw=1.2)
+    if injected is not None:
+        panels[1].plot(t, injected["rotation"], ":", color=style.INK, lw=1.2)
     style.style_axes(panels[1]).set_title("rotation [deg]", fontsize=9.5)
     _draw_with_error(panels[2], t, columns["optical_gain"], columns["optical_gain_sigma"], style.SERIES[0])
     style.style_axes(panels[2]).set_title("mean optical gain relative to the first matrix", fontsize=9.5)

@@ -1,4 +1,4 @@
-"""Progress in a notebook: one output that changes in place, and no widgets to be installed."""
+"""Progress in a notebook: one output that is updated in place, without widgets."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ import time
 from html import escape
 from typing import Any
 
-#: Seconds between two pictures of the same stage.
+#: Seconds between two updates of the same stage.
 _PERIOD_S = 0.2
 
 
 class NotebookProgress:
-    """Bars below each other, one for each stage; the last one moves."""
+    """One bar for each stage, below each other."""
 
     def __init__(self) -> None:
-        # It is there wherever a notebook runs, and nowhere else needed.
+        # Installed wherever a notebook runs, and needed there only.
         self._display: Any = importlib.import_module("IPython.display")
         self._handle: Any = None
         self._finished_stages: list[str] = []
@@ -23,7 +23,7 @@ class NotebookProgress:
         self._drawn = 0.0
 
     def draw(self, stage: str, done: int, total: int, text: str) -> None:
-        """Show how far a stage is; the first call makes the output."""
+        """Update the bar of a stage; the first call creates the output."""
         now = time.monotonic()
         if stage == self._stage and done != total and now - self._drawn < _PERIOD_S:
             return
@@ -33,13 +33,13 @@ class NotebookProgress:
         self._show(bar_html(stage, done, total, text))
 
     def finish(self) -> None:
-        """Nothing more comes: what was reached is shown whole."""
+        """Show the last stage as finished."""
         if self._handle is not None:
             self._end_stage()
             self._show("")
 
     def _end_stage(self) -> None:
-        """A stage that had an end has reached it; one that had none was only waiting."""
+        # A stage without a total only waited, and leaves no bar.
         if self._total:
             self._finished_stages.append(bar_html(self._stage, self._total, self._total, "done"))
         self._stage, self._total = "", 0
@@ -53,7 +53,7 @@ class NotebookProgress:
 
 
 def bar_html(stage: str, done: int, total: int, text: str) -> str:
-    """One bar; what goes on until it is stopped has a total of 0, and a bar without a place."""
+    """One bar; a stage that runs until it is stopped has a total of 0, and an indeterminate bar."""
     place = f"value='{done}' max='{total}'" if total else ""
     return (
         "<div style='font-variant-numeric:tabular-nums'>"

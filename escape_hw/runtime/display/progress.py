@@ -1,4 +1,4 @@
-"""Progress bars with the time left, on standard error."""
+"""Progress bars with the remaining time, on standard error."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from rich.progress import Progress as RichProgress
 from escape_hw.api.procedure import Progress
 from escape_hw.runtime.display.notebook import NotebookProgress
 
-#: Seconds between two lines where no bar can be drawn.
+#: Seconds between two lines without a terminal.
 _LINE_PERIOD_S = 10.0
 
 
 class ProgressView:
-    """Shows a procedure's progress: bars on a terminal or in a notebook, now and then a line elsewhere."""
+    """Shows a procedure's progress: bars on a terminal or in a notebook, lines elsewhere."""
 
     def __init__(self, console: Console, quiet: bool = False) -> None:
         self._console, self._quiet = console, quiet
@@ -29,7 +29,7 @@ class ProgressView:
         self._last_line = 0.0
 
     def __enter__(self) -> Self:
-        """Begin to draw."""
+        """Open the bars."""
         if self._quiet:
             return self
         if self._console.is_jupyter:
@@ -51,7 +51,7 @@ class ProgressView:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Stop drawing."""
+        """Close the bars."""
         if self._notebook is not None and error is None:
             self._notebook.finish()
         if self._bars is not None:
@@ -59,7 +59,7 @@ class ProgressView:
             self._bars = None
 
     def __call__(self, progress: Progress) -> None:
-        """Observe one progress."""
+        """Show one progress."""
         if self._quiet:
             return
         if self._notebook is not None:
@@ -109,17 +109,17 @@ def _format_metrics(progress: Progress) -> str:
 
 
 def _format_remaining(progress: Progress) -> str:
-    """The time left; not after a first step, which may have compiled or warmed up something."""
+    """The time left; empty after the first step, which may include a compilation."""
     return format_time_left(progress.remaining_s) if progress.done > 1 else ""
 
 
 def format_time_left(seconds: float) -> str:
-    """The time left in words; empty while unknown."""
+    """Remaining time as text; empty while unknown."""
     if not 0 <= seconds < 1e7:
         return ""
-    of_total = round(seconds)
-    if of_total < 60:
-        return f"{of_total} s left"
-    if of_total < 3600:
-        return f"{of_total // 60} min {of_total % 60:02d} s left"
-    return f"{of_total // 3600} h {of_total % 3600 // 60:02d} min left"
+    left = round(seconds)
+    if left < 60:
+        return f"{left} s left"
+    if left < 3600:
+        return f"{left // 60} min {left % 60:02d} s left"
+    return f"{left // 3600} h {left % 3600 // 60:02d} min left"

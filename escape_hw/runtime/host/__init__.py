@@ -1,1 +1,1 @@
-"""The computer and its devices outside of any calibration: environment check, device discovery, udev rules, tools for a single mirror or camera."""
+"""Host computer and single devices: checks, discovery, udev rules, process pools, tools for one device."""

@@ -1,4 +1,4 @@
-"""What this computer says of itself, read from the kernel's own files."""
+"""Properties of this computer, read from the kernel's files."""
 
 from __future__ import annotations
 
@@ -38,19 +38,13 @@ class SerialLine:
 
 
 class Host:
-    """Reads below a root folder, so that another computer's files can be read, too.
-
-    Parameters
-    ----------
-    root
-        Where ``/sys``, ``/proc`` and ``/dev`` lie.
-    """
+    """Reader of a computer's ``/sys``, ``/proc`` and ``/dev`` below a root folder."""
 
     def __init__(self, root: Path = Path("/")) -> None:
         self.root = root
 
     def text(self, path: str) -> str | None:
-        """A file's text without the line end; ``None`` where there is none."""
+        """Text of a file, stripped; ``None`` when it cannot be read."""
         try:
             return (self.root / path).read_text(encoding="utf-8", errors="replace").strip()
         except OSError:
@@ -58,18 +52,18 @@ class Host:
 
     # ------------------------------------------------------------------ limits
     def usbfs_mb(self) -> int | None:
-        """Memory for USB transfers in megabytes, 0 without limit; ``None``: no USB here."""
+        """Memory for USB transfers in megabytes, 0 without limit; ``None`` without USB."""
         value = self.text("sys/module/usbcore/parameters/usbfs_memory_mb")
         return int(value) if value is not None and value.isdigit() else None
 
     def governors(self) -> set[str]:
-        """Frequency governors of the processors; empty where there are none, as on virtual machines."""
+        """Frequency governors of the processors; empty on virtual machines."""
         folder = self.root / "sys/devices/system/cpu"
         files = folder.glob("cpu[0-9]*/cpufreq/scaling_governor")
         return {word for file in files if (word := self.text(str(file.relative_to(self.root))))}
 
     def real_time_limits(self) -> tuple[int, int]:
-        """Highest real-time priority and bytes of locked memory that this user may ask for; -1: any."""
+        """Highest real-time priority and bytes of locked memory of this user; -1: unlimited."""
         return (
             resource.getrlimit(resource.RLIMIT_RTPRIO)[1],
             resource.getrlimit(resource.RLIMIT_MEMLOCK)[1],
@@ -87,7 +81,7 @@ class Host:
 
     # ------------------------------------------------------------------ devices
     def usb_devices(self) -> list[UsbDevice]:
-        """Everything on USB, sorted by file."""
+        """USB devices, sorted by file."""
         folder = self.root / "sys/bus/usb/devices"
         found = (
             self._read_usb_device(path) for path in sorted(folder.glob("*")) if (path / "idVendor").is_file()
@@ -95,13 +89,13 @@ class Host:
         return sorted(found, key=lambda device: device.path)
 
     def _read_usb_device(self, folder: Path) -> UsbDevice:
-        def read_attribute(name: str) -> str:
+        def read(name: str) -> str:
             return self.text(str((folder / name).relative_to(self.root))) or ""
 
-        bus, number = read_attribute("busnum") or "0", read_attribute("devnum") or "0"
+        bus, number = int(read("busnum") or 0), int(read("devnum") or 0)
         return UsbDevice(
-            read_attribute("idVendor"), read_attribute("idProduct"), read_attribute("manufacturer"), read_attribute("product"), read_attribute("serial"),
-            f"/dev/bus/usb/{int(bus):03d}/{int(number):03d}",
+            read("idVendor"), read("idProduct"), read("manufacturer"), read("product"), read("serial"),
+            f"/dev/bus/usb/{bus:03d}/{number:03d}",
         )  # fmt: skip
 
     def serial_lines(self) -> list[SerialLine]:
@@ -117,14 +111,14 @@ class Host:
         return lines
 
     def users_of(self, path: str) -> list[str]:
-        """Processes that hold a file open, as ``name (pid)``; those of others only for root."""
+        """Processes with a file open, as ``name (pid)``; those of other users only for root."""
         wanted = os.path.realpath(self.root / path.lstrip("/"))
         users = []
         for process in sorted((self.root / "proc").glob("[0-9]*")):
             try:
                 links = [os.path.realpath(link) for link in (process / "fd").iterdir()]
             except OSError:
-                continue  # gone meanwhile, or another user's
+                continue  # ended meanwhile, or another user's
             if wanted in links:
                 name = self.text(f"proc/{process.name}/comm") or "?"
                 users.append(f"{name} ({process.name})")
@@ -132,7 +126,7 @@ class Host:
 
 
 def user_name() -> str:
-    """Name of this user; its number where it has none."""
+    """Name of this user, or its number."""
     try:
         return pwd.getpwuid(os.getuid()).pw_name
     except KeyError:
@@ -140,12 +134,12 @@ def user_name() -> str:
 
 
 def route_to(host: str, port: int) -> tuple[str, str]:
-    """Our own address and interface on the way to a host; nothing is sent.
+    """Local address and interface of the route to a host; nothing is sent.
 
     Raises
     ------
     OSError
-        The name is unknown, or no way leads there.
+        The name is unknown, or there is no route.
     """
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.connect((host, port))
@@ -155,7 +149,7 @@ def route_to(host: str, port: int) -> tuple[str, str]:
             try:
                 answer = fcntl.ioctl(probe.fileno(), _SIOCGIFADDR, request)
             except OSError:
-                continue  # it has no address
+                continue  # no address
             if socket.inet_ntoa(answer[20:24]) == address:
                 return address, name
     return address, ""

@@ -1,4 +1,4 @@
-"""Hands on one device without any calibration: hold a shape, run a wave, watch a camera."""
+"""Tools for a single device: hold a shape, run a wave, record or monitor a camera."""
 
 from __future__ import annotations
 
@@ -17,23 +17,13 @@ from escape_hw.errors import CommandRejected
 
 #: Commands per second of a wave, and seconds over which it rises.
 WAVE_HZ, RISE_S = 100.0, 0.5
-#: Moments of a period at which a wave is checked before it starts.
+#: Phases of a period at which a wave is checked before it starts.
 _CHECKED_PHASES = 16
 
 
 @dataclass(frozen=True, slots=True)
 class DriveResult:
-    """What became of shapes that were sent, fractions of full stroke.
-
-    Parameters
-    ----------
-    commands
-        How many were sent.
-    skipped
-        How many the mirror itself did not execute.
-    peak
-        Largest value that reached the mirror.
-    """
+    """Commands sent, commands that the mirror skipped, and the largest value, fraction of full stroke."""
 
     commands: int
     skipped: int
@@ -42,16 +32,16 @@ class DriveResult:
 
 @dataclass(frozen=True, slots=True)
 class CameraStatistics:
-    """A camera for a while.
+    """Statistics of a camera's frames.
 
     Parameters
     ----------
     frames
-        Delivered.
+        Frames delivered.
     status
         The camera's own counters.
     rate_hz
-        By the frames' own times.
+        From the frames' times of exposure.
     mean, lowest, highest
         Counts over all pixels and frames.
     saturated
@@ -73,7 +63,7 @@ def poke_shape(dm: DeformableMirror, actuator: int, amplitude: float) -> NDArray
     Raises
     ------
     CommandRejected
-        The mirror could not take it as it is; the message says what it could.
+        It exceeds a limit; the message names the largest amplitude.
     """
     shape = dm.flat
     shape[actuator] += amplitude
@@ -83,13 +73,13 @@ def poke_shape(dm: DeformableMirror, actuator: int, amplitude: float) -> NDArray
         raise CommandRejected(
             dm.name,
             f"a poke of {amplitude:g} at actuator {actuator} is beyond its limits, which allow {moved:.4g} "
-            "beside the others at flat; ask for that or less",
+            "with the other actuators flat; choose that or less",
         )
     return shape
 
 
 def hold_shape(dm: DeformableMirror, shape: NDArray[np.float64], seconds: float) -> Procedure[DriveResult]:
-    """Send a shape, keep it for a while, and end flat.
+    """Hold a shape for a while, then flatten.
 
     Parameters
     ----------
@@ -98,7 +88,7 @@ def hold_shape(dm: DeformableMirror, shape: NDArray[np.float64], seconds: float)
     shape
         ``(n_act,)``, fractions of full stroke.
     seconds
-        How long, by the wall clock.
+        Duration by the wall clock.
     """
     report = Reporter("holding the shape", max(1, math.ceil(seconds)), "second")
     try:
@@ -115,12 +105,12 @@ def hold_shape(dm: DeformableMirror, shape: NDArray[np.float64], seconds: float)
 def wave_generator(
     dm: DeformableMirror, amplitude: float, waves: float
 ) -> Callable[[float], NDArray[np.float64]]:
-    """A wave over the mirror along x: a function that takes the phase in turns and gives ``(n_act,)``.
+    """A wave over the mirror along x: a function of the phase in turns that returns a shape ``(n_act,)``.
 
     Raises
     ------
     CommandRejected
-        At some moment it would break a limit; the message says which amplitude would not.
+        It exceeds a limit at some phase; the message names an amplitude that does not.
     """
     x = dm.info.positions_m[:, 0]
     along = waves * (x - x.min()) / max(float(np.ptp(x)), 1e-12)
@@ -136,7 +126,7 @@ def wave_generator(
     fraction = min(dm.largest_legal_scale(shape(k / _CHECKED_PHASES)) for k in range(_CHECKED_PHASES))
     if fraction < 1:
         raise CommandRejected(
-            dm.name, f"a wave of {amplitude:g} breaks its limits; {fraction * amplitude:.3g} would not"
+            dm.name, f"a wave of {amplitude:g} exceeds its limits; {fraction * amplitude:.3g} does not"
         )
     return shape
 
@@ -144,7 +134,7 @@ def wave_generator(
 def run_wave(
     dm: DeformableMirror, shape: Callable[[float], NDArray[np.float64]], frequency_hz: float, seconds: float
 ) -> Procedure[DriveResult]:
-    """Let a wave run over the mirror, rising slowly, and end flat.
+    """Run a wave over the mirror, with a slow rise, then flatten.
 
     Parameters
     ----------
@@ -155,7 +145,7 @@ def run_wave(
     frequency_hz
         Periods per second.
     seconds
-        How long, by the wall clock.
+        Duration by the wall clock.
     """
     report = Reporter("wave", max(1, math.ceil(seconds)), "second")
     commands = skipped = 0
@@ -176,17 +166,7 @@ def run_wave(
 
 
 def grab_frames(camera: Camera, frames: int, timeout_s: float) -> Procedure[list[Frame]]:
-    """Take frames one after the other.
-
-    Parameters
-    ----------
-    camera
-        An open camera.
-    frames
-        How many.
-    timeout_s
-        Longest wait for each, seconds.
-    """
+    """Record frames of an open camera; each may take ``timeout_s`` seconds."""
     report = Reporter("grabbing", frames)
     found: list[Frame] = []
     for number in range(1, frames + 1):
@@ -198,17 +178,7 @@ def grab_frames(camera: Camera, frames: int, timeout_s: float) -> Procedure[list
 
 
 def monitor_camera(camera: Camera, seconds: float, timeout_s: float) -> Procedure[CameraStatistics]:
-    """Watch a camera for so many seconds of its own clock.
-
-    Parameters
-    ----------
-    camera
-        An open camera.
-    seconds
-        How long.
-    timeout_s
-        Longest wait for a frame, seconds.
-    """
+    """Statistics of an open camera over a duration by its own clock; each frame may take ``timeout_s``."""
     report = Reporter("watching", max(1, math.ceil(seconds)), "second")
     frames = saturated = highest = 0
     lowest, total, first_ns, last_ns = camera.info.full_scale, 0.0, 0, 0

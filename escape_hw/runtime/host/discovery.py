@@ -1,4 +1,4 @@
-"""Finds devices without opening them."""
+"""Discovery of devices without opening them."""
 
 from __future__ import annotations
 
@@ -12,29 +12,28 @@ from escape_hw.api.discovery import DiscoveredDevice, Discoverer
 from escape_hw.runtime.host.computer import Host, SerialLine, UsbDevice
 
 GROUP = "escape.discover"
-#: What is known of USB devices by vendor: kind, driver, section.
+#: Kind, driver and section of USB devices, by vendor number.
 _USB = {
     "20f7": ("camera", "ximea", "wfs"),
     "1e10": ("camera", "aravis", "science"),
     "1724": ("camera", "aravis", "science"),
     "1a72": ("modulator", "pi-e727", "modulator"),
 }
-#: Vendors of serial lines that a controller of PI's may be behind.
+#: Vendors of serial adapters that a PI controller may use.
 _SERIAL = ("0403", "1a72")
-#: Where ALPAO's SDK looks for the files of a mirror.
+#: Variables with the folder of a mirror's files, as in ALPAO's SDK.
 _ALPAO_VARIABLES = ("ACECFG", "ACEROOT")
 
 
 def discover(hosts: Sequence[str] = (), host: Host | None = None) -> list[DiscoveredDevice]:
-    """Everything that can be seen.
+    """Devices on USB, on serial lines, with ALPAO files, and those that drivers find on the given hosts.
 
     Parameters
     ----------
     hosts
-        Computers to ask for devices on the network, ``name`` or ``name:port``; the network is never
-        searched through.
+        Network hosts to query, ``name`` or ``name:port``; the network is never scanned.
     host
-        This computer.
+        The computer; this one by default.
     """
     host = host or Host()
     found = [*_find_usb(host), *_find_serial(host), *_find_alpao(host)]
@@ -78,7 +77,7 @@ def device_section_toml(section: str, driver: str, serial: str) -> str:
 
 
 def _find_alpao(host: Host) -> Iterator[DiscoveredDevice]:
-    """Mirrors whose files are there; the SDK tells only by opening them whether they are, too."""
+    """Mirrors with a configuration file; whether they are connected is known only when they are opened."""
     for variable in _ALPAO_VARIABLES:
         if not os.environ.get(variable):
             continue

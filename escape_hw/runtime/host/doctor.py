@@ -1,4 +1,4 @@
-"""Looks whether this computer can do what real devices need."""
+"""Checks that this computer is set up for real devices."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ if TYPE_CHECKING:
 
 Level = Literal["ok", "info", "warning", "error"]
 
-#: Group of the vendors' libraries, by driver (:class:`~escape_hw.api.discovery.NativeLibrary`).
+#: Entry points of vendor libraries, by driver (:class:`~escape_hw.api.discovery.NativeLibrary`).
 LIBRARIES = "escape.libraries"
-#: Where drivers look for their device unless their section says otherwise.
+#: Default host and port of devices on the network, by driver.
 DEFAULT_ADDRESSES = {"asm": ("127.0.0.1", 7336)}
-#: Port that is asked about where only the way matters.
+#: Port for a route to a host of which no port is known.
 _DISCARD = 9
-#: Python packages whose versions are worth telling.
+#: Python packages whose versions are reported.
 PACKAGES = ("numpy", "scipy", "numba", "astropy", "pyserial", "pyusb")
-#: Least memory for USB3 cameras, megabytes, and least free space for products, gigabytes.
+#: Least memory for USB3 cameras in megabytes, and least free space for products in gigabytes.
 USBFS_MB, FREE_GB = 1000, 5.0
 #: Least real-time priority for the threads of the loop.
 MIN_PRIORITY = 90
@@ -40,40 +40,40 @@ MIN_PRIORITY = 90
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One thing that was looked at.
+    """Result of one check.
 
     Parameters
     ----------
     item
-        What was looked at.
+        What was checked.
     level
-        ``ok``, ``info`` (told, not judged), ``warning`` (works, but not well) or ``error`` (will not work).
+        ``ok``, ``info`` (reported only), ``warning`` (works, but not well) or ``error`` (will not work).
     text
         What was found.
-    way_out
-        What to do about it; empty where nothing is to be done.
+    remedy
+        What to do about it; empty for nothing.
     """
 
     item: str
     level: Level
     text: str
-    way_out: str = ""
+    remedy: str = ""
 
 
 def check_computer(
     config: SystemConfig | None, host: Host | None = None, data: Path | None = None
 ) -> list[Finding]:
-    """Look at everything.
+    """Check packages, vendor libraries, permissions, USB, serial lines, processor, network and disk.
 
     Parameters
     ----------
     config
-        A system: what its real devices need becomes an error where it is missing. Without one every
-        driver is looked at, and what is missing is only told.
+        A system: missing needs of its real devices are errors. Without one every driver is checked, and
+        missing libraries are only reported.
     host
         The computer; this one by default.
     data
-        Folder that products go to; the user's by default.
+        Folder for products; the user's data folder by default.
     """
     host = host or Host()
     hardware = _hardware_sections(config)
@@ -90,13 +90,17 @@ def check_computer(
 
 
 def exit_code(findings: list[Finding]) -> int:
-    """0: all is well; 1: something is not as it should be; 2: something will not work."""
+    """0: no problem; 1: there are warnings; 2: there are errors."""
     levels = {finding.level for finding in findings}
     return 2 if "error" in levels else 1 if "warning" in levels else 0
 
 
+def _judge(item: str, ok: bool, text: str, remedy: str) -> Finding:
+    return Finding(item, "ok", text) if ok else Finding(item, "warning", text, remedy)
+
+
 def _hardware_sections(config: SystemConfig | None) -> dict[str, DeviceConfig] | None:
-    """Sections of the system's real devices by driver; ``None``: no system was named."""
+    """Sections of the system's real devices by driver; ``None`` without a system."""
     if config is None:
         return None
     from escape_hw.bench import resolve_mode
@@ -135,15 +139,13 @@ def _check_libraries(hardware: dict[str, DeviceConfig] | None) -> Iterator[Findi
         if found:
             yield Finding(library.title, "ok", f"{found} (driver '{driver}')")
             continue
-        remedy_text = (
-            f"{library.source}; or set {library.variable}, or options.library in its section, to a path"
-        )
+        remedy = f"{library.source}; or set {library.variable}, or options.library in its section, to a path"
         level: Level = "info" if hardware is None else "error"
-        yield Finding(library.title, level, f"driver '{driver}' cannot load it ({failures})", remedy_text)
+        yield Finding(library.title, level, f"driver '{driver}' cannot load it ({failures})", remedy)
 
 
 def _load_first(names: tuple[str, ...]) -> tuple[str, str]:
-    """The file that could be loaded and what went wrong with the others."""
+    """The first file that could be loaded, and the errors of the others."""
     failures = []
     for name in names:
         try:
@@ -168,39 +170,32 @@ def _loaded_file(name: str) -> str:
 # --------------------------------------------------------------------- permissions
 def _check_permissions(host: Host, hardware: dict[str, DeviceConfig] | None) -> Iterator[Finding]:
     if hardware is not None and not hardware:
-        yield Finding("devices", "info", "the system has no real devices: nothing below is needed for it")
+        yield Finding("devices", "info", "the system has no real devices: it needs nothing of the following")
     groups, user = host.groups(), user_name()
     missing = [group for group in udev.GROUPS if group not in groups] if user != "root" else []
-    if missing:
-        remedy_text = "; ".join(udev.remaining_commands(user))
-        yield Finding("groups", "warning", f"{user} is not in {', '.join(missing)}", remedy_text)
-    else:
-        yield Finding("groups", "ok", f"{user}: {', '.join(sorted(groups))}")
+    text = f"{user} is not in {', '.join(missing)}" if missing else f"{user}: {', '.join(sorted(groups))}"
+    yield _judge("groups", not missing, text, "; ".join(udev.remaining_commands(user)))
     try:
         due = [change for change in udev.plan_changes(host.root) if change.condition != "installed"]
     except ConfigError as error:
         yield Finding("udev", "error", str(error))
         return
-    if due:
-        changes = ", ".join(f"{change.target} {change.condition}" for change in due)
-        yield Finding("udev", "warning", changes, "escape udev install")
-    else:
-        yield Finding("udev", "ok", "rules and limits are installed")
+    changes = ", ".join(f"{change.target} {change.condition}" for change in due)
+    yield _judge("udev", not due, changes or "rules and limits are installed", "escape udev install")
 
 
 def _check_usb(host: Host, hardware: dict[str, DeviceConfig] | None) -> Iterator[Finding]:
     mb = host.usbfs_mb()
     if mb is None:
         needed = hardware is not None and {"ximea", "aravis"} & set(hardware)
-        remedy_text = "cameras need a USB port; a virtual machine must be given one" if needed else ""
-        yield Finding("usbfs memory", "error" if needed else "info", "this computer has no USB", remedy_text)
-    elif 0 < mb < USBFS_MB:
-        remedy_text = (
-            "escape udev install, then restart; or usbcore.usbfs_memory_mb=1000 on the kernel's command line"
-        )
-        yield Finding("usbfs memory", "warning", f"{mb} MB; USB3 cameras stall below {USBFS_MB}", remedy_text)
-    else:
-        yield Finding("usbfs memory", "ok", f"{mb} MB" if mb else "without limit")
+        remedy = "cameras need a USB port; a virtual machine must be given one" if needed else ""
+        yield Finding("usbfs memory", "error" if needed else "info", "this computer has no USB", remedy)
+        return
+    text, enough = f"{mb} MB" if mb else "without limit", not 0 < mb < USBFS_MB
+    yield _judge(
+        "usbfs memory", enough, text if enough else f"{text}; USB3 cameras stall below {USBFS_MB}",
+        "escape udev install, then restart; or usbcore.usbfs_memory_mb=1000 on the kernel's command line",
+    )  # fmt: skip
 
 
 def _check_serial(host: Host) -> Iterator[Finding]:
@@ -208,40 +203,33 @@ def _check_serial(host: Host) -> Iterator[Finding]:
         item = f"latency of {line.path}"
         if line.latency_ms is None:
             yield Finding(item, "info", "its chip has no latency timer")
-        elif line.latency_ms > 1:
-            text = f"{line.latency_ms} ms on every answer of {line.usb.name or line.usb.serial}"
-            yield Finding(item, "warning", text, "escape udev install, then plug it in again")
-        else:
-            yield Finding(item, "ok", f"{line.latency_ms} ms")
+            continue
+        text, short = f"{line.latency_ms} ms", line.latency_ms <= 1
+        text += "" if short else f" on every answer of {line.usb.name or line.usb.serial}"
+        yield _judge(item, short, text, "escape udev install, then plug it in again")
 
 
 def _check_processor(host: Host) -> Iterator[Finding]:
     governors = host.governors()
     if not governors:
         yield Finding("governor", "info", "the processors' frequency is not set here (a virtual machine?)")
-    elif governors != {"performance"}:
-        remedy_text = "sudo cpupower frequency-set --governor performance"
-        yield Finding(
-            "governor", "warning", f"{', '.join(sorted(governors))}: frames will jitter", remedy_text
-        )
     else:
-        yield Finding("governor", "ok", "performance")
+        text, steady = ", ".join(sorted(governors)), governors == {"performance"}
+        remedy = "sudo cpupower frequency-set --governor performance"
+        yield _judge("governor", steady, text if steady else f"{text}: frames will jitter", remedy)
     priority, memory = host.real_time_limits()
-    remedy_text = "escape udev install, join the group 'realtime', then log in again"
-    if 0 <= priority < MIN_PRIORITY:
-        yield Finding(
-            "real-time priority", "warning", f"at most {priority}; {MIN_PRIORITY} is wanted", remedy_text
-        )
-    else:
-        yield Finding("real-time priority", "ok", "any" if priority < 0 else str(priority))
-    if memory >= 0:
-        yield Finding("locked memory", "warning", f"at most {memory / 1e6:.0f} MB", remedy_text)
-    else:
-        yield Finding("locked memory", "ok", "without limit")
+    remedy = "escape udev install, join the group 'realtime', then log in again"
+    low = 0 <= priority < MIN_PRIORITY
+    text = (
+        f"at most {priority}; {MIN_PRIORITY} is needed" if low else "any" if priority < 0 else str(priority)
+    )
+    yield _judge("real-time priority", not low, text, remedy)
+    text = f"at most {memory / 1e6:.0f} MB" if memory >= 0 else "without limit"
+    yield _judge("locked memory", memory < 0, text, remedy)
 
 
 def _check_network(hardware: dict[str, DeviceConfig] | None) -> Iterator[Finding]:
-    """The interface towards every real device that has an address."""
+    """The interface of the route to every real device with an address."""
     for driver, section in (hardware or {}).items():
         host, port = _address(driver, section)
         if not host or host == "emulator":
@@ -250,14 +238,14 @@ def _check_network(hardware: dict[str, DeviceConfig] | None) -> Iterator[Finding
         try:
             address, interface = route_to(host, port)
         except OSError as error:
-            yield Finding(item, "error", f"no way leads to {host} ({error})", "check name, address and cable")
+            yield Finding(item, "error", f"no route to {host} ({error})", "check name, address and cable")
             continue
         text = f"{host} by {interface or 'an interface without a name'}, our address {address}"
         yield Finding(item, "ok", text)
 
 
 def _address(driver: str, section: DeviceConfig) -> tuple[str, int]:
-    """Host and port of a device as configured; an empty host where it is not on a network."""
+    """Configured host and port of a device; an empty host without a network."""
     wire = getattr(section, "wire", None)
     if wire is not None:
         return (wire.host, wire.port) if wire.kind == "tcp" else ("", 0)
@@ -268,12 +256,12 @@ def _address(driver: str, section: DeviceConfig) -> tuple[str, int]:
 
 
 def _alpao_address(section: DeviceConfig) -> str:
-    """The address in the text file that comes with an ALPAO mirror; empty for electronics on a card."""
+    """The address in the configuration file of an ALPAO mirror; empty for electronics on a card."""
     folder = str(section.options.get("config_folder", "") or os.environ.get("ACECFG", ""))
     try:
         text = (Path(folder) / f"{section.serial.upper()}.acfg").read_text(errors="replace")
     except OSError:
-        return ""  # the library tells when it is opened
+        return ""  # reported by the library when the mirror is opened
     found = re.search(r"\b\d{1,3}(?:\.\d{1,3}){3}\b", text)
     return found[0] if found else ""
 
@@ -283,8 +271,5 @@ def _check_disk_space(folder: Path) -> Iterator[Finding]:
     while not place.exists():
         place = place.parent
     free = shutil.disk_usage(place).free / 1e9
-    text = f"{free:.1f} GB in {place}"
-    if free < FREE_GB:
-        yield Finding("free space", "warning", text, "clear up, or choose another folder with --out")
-    else:
-        yield Finding("free space", "ok", text)
+    remedy = "delete files, or choose another folder with --out"
+    yield _judge("free space", free >= FREE_GB, f"{free:.1f} GB in {place}", remedy)

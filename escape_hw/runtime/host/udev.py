@@ -1,4 +1,4 @@
-"""Rules and limits of the machine: what is installed, what would change, and changing it."""
+"""Installation of udev rules and of limits for real-time processes and USB memory."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ import escape_hw.errors
 from escape_hw.errors import ConfigError, StorageError
 from escape_hw.io.storage import make_folder, write_atomic
 
-#: Files that come with the package, and where the system looks for them.
+#: Files of the package, and the folders they are installed in.
 TARGETS = {
     "70-escape.rules": "etc/udev/rules.d",
     "90-escape-realtime.conf": "etc/security/limits.d",
@@ -29,16 +29,9 @@ Condition = Literal["missing", "different", "installed"]
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """One file of the plan.
+    """One file to install: its copy in the package, its target with its condition, and their difference.
 
-    Parameters
-    ----------
-    source, target
-        What is copied, and where to.
-    condition
-        Of the target now.
-    difference
-        Unified difference from the present target to what it would be; empty when there is none.
+    ``difference`` is a unified difference from the present target to the new one; empty when they agree.
     """
 
     source: Path
@@ -48,7 +41,7 @@ class Change:
 
 
 def find_packaged_files() -> Path:
-    """The folder with the files: beside the checkout, or in the environment's ``share``.
+    """Folder of the files: in the checkout, or in the environment's ``share``.
 
     Raises
     ------
@@ -65,12 +58,12 @@ def find_packaged_files() -> Path:
         if all((place / name).is_file() for name in TARGETS):
             return place
     raise ConfigError(
-        f"the files of udev are in none of {', '.join(map(str, places))}; install the package again"
+        f"the udev files are in none of {', '.join(map(str, places))}; install the package again"
     )
 
 
 def plan_changes(root: Path = Path("/")) -> list[Change]:
-    """What installing would change below ``root``; changes nothing.
+    """The changes that the installation would make below ``root``; changes nothing.
 
     Raises
     ------
@@ -98,7 +91,7 @@ def _change(source: Path, target: Path) -> Change:
 
 
 def is_writable(changes: list[Change]) -> bool:
-    """True when this user may make the changes."""
+    """Whether this user may write the targets."""
     for change in changes:
         folder = change.target.parent
         while not folder.exists():
@@ -109,7 +102,7 @@ def is_writable(changes: list[Change]) -> bool:
 
 
 def apply_changes(changes: list[Change]) -> list[Path]:
-    """Make the changes; returns the files written. What is installed already is left alone.
+    """Install the files that are missing or different; returns the files written.
 
     Raises
     ------
@@ -121,14 +114,14 @@ def apply_changes(changes: list[Change]) -> list[Path]:
         if change.condition != "installed":
             make_folder(change.target.parent)
             write_atomic(change.target, change.source.read_bytes())
-            # Rules are read by everybody.
+            # Readable by every user.
             change.target.chmod(0o644)
             written.append(change.target)
     return written
 
 
 def reload_rules() -> list[str]:
-    """Have the running udev read the rules again; returns what went wrong."""
+    """Make the running udev read the rules again; returns its errors."""
     udevadm = shutil.which("udevadm")
     if udevadm is None:
         return ["udevadm is not installed; the rules take effect after a restart"]
@@ -145,7 +138,7 @@ def reload_rules() -> list[str]:
 
 
 def remaining_commands(user: str) -> list[str]:
-    """Commands that remain to be given by hand, with what they are for."""
+    """Commands for the user's groups, which the installation does not run."""
     groups = ",".join(GROUPS)
     return [
         "sudo groupadd --system --force realtime",

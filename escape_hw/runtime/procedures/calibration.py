@@ -143,6 +143,10 @@ class CalibrationProcedure(ProcedureSpec["CalibrationResult"]):
         """Arguments of :func:`calibrate_with_method` that not all methods have."""
         return {}
 
+    def _is_short_run(self, bench: Bench) -> bool:
+        """Whether the run is too short for a measured matrix, so that it cannot be resumed."""
+        return False
+
     def procedure(self, bench: Bench, folder: RunFolder | None) -> Procedure[CalibrationResult]:
         """Calibrate; the state is saved in the folder meanwhile, so that the run can be resumed."""
         from escape_hw.calibration.acquisition.checkpoint import Checkpoint
@@ -153,7 +157,9 @@ class CalibrationProcedure(ProcedureSpec["CalibrationResult"]):
             require_hardware_matrix(self._control_matrix, bench, self.force)
         if folder is not None:
             source = None if self.resume is None else self.resume / STATE_FILE
-            self._checkpoint = Checkpoint(folder.file(STATE_FILE), source, request=self.request())
+            # A short run cannot be resumed; escape() refuses to resume one.
+            if source is not None or not self._is_short_run(bench):
+                self._checkpoint = Checkpoint(folder.file(STATE_FILE), source, request=self.request())
         return calibrate_with_method(
             bench, self.name, frames=self.frames, poke=self.poke, **self.method_options(),
             closed_loop=None if self._control_matrix is None else self._control_matrix.result,
@@ -215,7 +221,7 @@ class ClosedLoopCalibration(CalibrationProcedure):
 
     closed_loop: Path | None = parameter(
         default=None, help="Measure in closed loop, with this control matrix.",
-        label="Control matrix (closed loop)", kind="matrix", deprecated=("closing",),
+        label="Control matrix", kind="matrix", deprecated=("closing",),
     )  # fmt: skip
 
     def load(self, config: SystemConfig, simulated: bool = False) -> None:
@@ -277,6 +283,13 @@ class EscapeProcedure(DocrimeProcedure, SprintParameters["CalibrationResult"]):
     def method_options(self) -> dict[str, Any]:
         """Whether the turbulence is whitened, and the data that are fitted."""
         return {"whiten": self.whiten, "estimator": self.estimator}
+
+    def _is_short_run(self, bench: Bench) -> bool:
+        from escape_hw.calibration.escape.method import is_short_run
+
+        c, closed_loop = bench.config, self._control_matrix
+        n_modes = c.basis.n_modes if closed_loop is None else closed_loop.matrix.n_modes
+        return is_short_run(c.calibration, n_modes, frames=self.frames, **self.method_options())
 
 
 class PushPullProcedure(CalibrationProcedure):

@@ -53,14 +53,14 @@ def gains_converged(result: GainsResult) -> dict[str, Any]:
 
 
 def injected_value_recovered(
-    label: str, estimate: RegistrationEstimate, planted: Registration
+    label: str, estimate: RegistrationEstimate, injected: Registration
 ) -> dict[str, Any]:
-    """The planted registration lies within the error bars."""
+    """The injected registration lies within the error bars."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        pulls = np.abs(estimate.registration.to_array() - planted.to_array()) / estimate.sigma
+        pulls = np.abs(estimate.registration.to_array() - injected.to_array()) / estimate.sigma
     worst = float(pulls.max())  # NaN, from no error and no difference, counts as not met
     return criterion(
-        f"{label}: planted registration recovered within {_LARGEST_PULL:g} standard errors "
+        f"{label}: injected registration recovered within {_LARGEST_PULL:g} standard errors "
         f"(largest pull {worst:.1f}, {_readable_name(PARAMETERS[int(pulls.argmax())])})",
         worst <= _LARGEST_PULL,
     )
@@ -69,12 +69,13 @@ def injected_value_recovered(
 def short_and_long_agree(short: RegistrationEstimate, long: RegistrationEstimate) -> list[dict[str, Any]]:
     """SHORT and LONG agree at least as well as the paper's, parameter by parameter."""
     criteria_met = []
-    for name, value in short.measured().items():
-        difference = abs(value.value - long.measured()[name].value)
+    for name, value in short.parameters().items():
+        difference = abs(value.value - long.parameters()[name].value)
         allowed = PAPER_DIFFERENCES[name]
         criteria_met.append(
             criterion(
-                f"SHORT and LONG agree in {_readable_name(name)}: {difference:.3g} (paper: {allowed:g} {value.unit})",
+                f"SHORT and LONG agree in {_readable_name(name)}: {difference:.3g} "
+                f"(paper: {allowed:g} {value.unit})",
                 difference <= allowed,
             )
         )

@@ -95,8 +95,8 @@ class GainsProcedure(MatrixProcedure["GainsRun"]):
                 budget=self.allowed_strehl_loss,
                 frames=self.frames,
                 gain=self.gain,
-                beside=self._comparison_matrices(),
-                shape=static_light_matrix(bench, self.product.result),
+                comparisons=self._comparison_matrices(),
+                closed_loop_matrix=static_light_matrix(bench, self.product.result),
                 model_psf=model,
             )
         )

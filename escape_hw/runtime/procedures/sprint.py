@@ -38,8 +38,8 @@ class SprintParameters(ProcedureSpec[ResultT]):
     extra_parameters: str | None = parameter(
         default=None,
         help="What SPRINT fits beside the registration, separated by commas.",
-        config_key="calibration.extra_parameters", kind="choices", choices=EXTRA_PARAMETERS, sets_config=True, last=True,
-        deprecated=("also",),
+        config_key="calibration.extra_parameters", kind="choices", choices=EXTRA_PARAMETERS,
+        sets_config=True, last=True, deprecated=("also",),
     )  # fmt: skip
 
 

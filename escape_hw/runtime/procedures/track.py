@@ -98,12 +98,14 @@ class TrackProcedure(MatrixProcedure["TrackResult"]):
                 **record.header_fields("track"),
                 "title": f"Tracking {record.system}",
                 **track,
-                "planted_course": None
+                "injected_course": None
                 if injected is None
                 else injected.trajectory(began, track["track"]["seconds"]),
-                # Injected registration at the time of the last estimate.
-                "planted_end": None if injected is None or not end else injected.at(began + end[0]).to_dict(),
-                "planted_note": INJECTED_UNKNOWN if record.simulated and injected is None else "",
+                # The truth where the track ends, beside its registration there.
+                "injected_end": None
+                if injected is None or not end
+                else injected.at(began + end[0]).to_dict(),
+                "injected_note": INJECTED_UNKNOWN if record.simulated and injected is None else "",
                 "im": self.product.path.absolute(),
                 "criteria": [
                     {"text": "loop stable", "met": result.stable},

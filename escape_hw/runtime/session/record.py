@@ -19,8 +19,8 @@ from escape_hw.io.provenance import Provenance, format_utc, get_git_state, get_s
 class BenchRecord:
     """Identity of an opened bench, kept after it is closed.
 
-    ``planted`` is the registration hidden in a twin: for reports only, no estimator may see it. ``asked``
-    is what a run that can be gone on with was asked for.
+    ``injected`` is the true registration of a simulated mirror, for reports only: no estimator reads it.
+    ``request`` holds the options of a run that can be resumed.
     """
 
     system: str
@@ -32,9 +32,9 @@ class BenchRecord:
     layout: tuple[str, ...]
     places_m: tuple[tuple[float, float], ...]
     psf_px: float | None
-    planted: Registration | None
+    injected: Registration | None
     started: datetime = field(default_factory=lambda: datetime.now(UTC))
-    asked: Mapping[str, Any] | None = None
+    request: Mapping[str, Any] | None = None
 
     @classmethod
     def from_bench(cls, bench: Bench) -> BenchRecord:
@@ -55,7 +55,7 @@ class BenchRecord:
             layout=actuator_layout(bench),
             places_m=actuator_positions(bench),
             psf_px=None if science is None else float(science.psf_px),
-            planted=config.twin.registration.to_registration() if is_static else None,
+            injected=config.twin.registration.to_registration() if is_static else None,
         )
 
     def origin(self, parents: Mapping[str, str] | None = None) -> Provenance:
@@ -69,8 +69,8 @@ class BenchRecord:
             "software": get_software_version(),
             "git": get_git_state(),
             "started_utc": format_utc(self.started),
-            **({} if self.asked is None else {"asked": dict(self.asked)}),
-            "planted": None if self.planted is None else self.planted.to_dict(),
+            **({} if self.request is None else {"request": dict(self.request)}),
+            "injected": None if self.injected is None else self.injected.to_dict(),
             "bench": {
                 "layout": list(self.layout),
                 "places_m": [list(place) for place in self.places_m],

@@ -285,7 +285,7 @@ class System(Bench):
         calibration = as_calibration(calibration)
         procedure = bootstrap_gains(
             self, calibration, poke=poke, accuracy=accuracy, budget=allowed_strehl_loss, frames=frames,
-            gain=gain, shape=static_light_matrix(self, calibration), model_psf=model_psf,
+            gain=gain, closed_loop_matrix=static_light_matrix(self, calibration), model_psf=model_psf,
         )  # fmt: skip
         return self.run(procedure, progress=progress)
 

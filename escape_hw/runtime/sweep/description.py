@@ -1,29 +1,33 @@
-"""What a sweep's folder says of it, so that it can be resumed, or joined by another machine."""
+"""``sweep.json``: a sweep and its storage, from which it is resumed or joined by another machine."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from escape_hw.api.procedure import Procedure
+from escape_hw.bench import Bench
 from escape_hw.config.loader import load_text
 from escape_hw.errors import ConfigError, ProductError
 from escape_hw.io.documents import dumps
 from escape_hw.io.provenance import file_sha256
 from escape_hw.io.storage import write_atomic
-from escape_hw.runtime.sweep.design import Design, MatrixVariant
-from escape_hw.runtime.sweep.run import METRICS, Sweep
-from escape_hw.runtime.sweep.search_space import parse_parameter
-from escape_hw.runtime.sweep.study import SAMPLERS, STORAGE_TIMEOUT_S, SweepStore, redact_password
+from escape_hw.runtime.procedures.calibration import model_psf
+from escape_hw.runtime.sweep.design import METRICS, Design, MatrixVariant, Sweep, current_keys
+from escape_hw.runtime.sweep.search_space import DELAY_KEY, Parameter, format_value, parse_parameter
+from escape_hw.runtime.sweep.study import SAMPLERS, STORAGE_TIMEOUT_S, SweepStudy, redact_password
 
 DESCRIPTION_FILE = "sweep.json"
 
 
 @dataclass(frozen=True, slots=True)
 class SweepDescription:
-    """A sweep and where its trials are kept.
+    """A sweep and where its trials are stored.
 
     Parameters
     ----------
@@ -34,7 +38,7 @@ class SweepDescription:
     sampler
         ``"random"`` or ``"tpe"``.
     margin
-        Difference in the Strehl ratio that does not matter.
+        Largest difference in the Strehl ratio that counts as equivalent.
     """
 
     sweep: Sweep
@@ -44,12 +48,12 @@ class SweepDescription:
     margin: float
 
     def validate(self) -> SweepDescription:
-        """The same, if its parts go together.
+        """The same description, if it is consistent.
 
         Raises
         ------
         ConfigError
-            They do not, a varied key does not exist, or one of its limits is out of range.
+            It is not, a varied key does not exist, or one of its limits is out of range.
         """
         sweep, design = self.sweep, self.sweep.design
         if self.sampler not in SAMPLERS:
@@ -58,18 +62,18 @@ class SweepDescription:
             raise ConfigError(f"--metric {sweep.metric}: unknown; it is one of {', '.join(METRICS)}")
         if not self.margin > 0:
             raise ConfigError(f"--margin {100 * self.margin:g}: it must be positive")
-        if design.trials < len(sweep.arms):
-            raise ConfigError(f"--trials {design.trials}: fewer than the {len(sweep.arms)} matrices")
+        if design.trials < len(sweep.variants):
+            raise ConfigError(f"--trials {design.trials}: fewer than the {len(sweep.variants)} matrices")
         for one in sweep.space:
-            _check_limits(sweep, one.key, (one.at(0.0), one.at(1.0)))
+            _check_limits(sweep, one)
         return self
 
     def settings(self) -> dict[str, Any]:
-        """What must be the same for a study to be gone on with."""
+        """The settings that must agree to resume a study."""
         sweep = self.sweep
         return {
             "config": sweep.config,
-            "matrices": [[arm.label, arm.sha256] for arm in sweep.arms],
+            "matrices": [[one.label, one.sha256] for one in sweep.variants],
             "parameters": [one.to_text() for one in sweep.space],
             "design": asdict(sweep.design),
             "frames": sweep.frames,
@@ -78,22 +82,21 @@ class SweepDescription:
             "sampler": self.sampler,
         }
 
-    def store(self, timeout_s: float = STORAGE_TIMEOUT_S) -> SweepStore:
+    def open_study(self, timeout_s: float = STORAGE_TIMEOUT_S) -> SweepStudy:
         """The study.
 
         Raises
         ------
         ConfigError, StorageError
-            See :class:`~escape_hw.runtime.sweep.study.SweepStore`.
+            See :class:`~escape_hw.runtime.sweep.study.SweepStudy`.
         """
-        sweep = self.sweep
-        return SweepStore(
-            self.storage, self.study, self.settings(), sweep.arms, sweep.space, sweep.seed,
-            use_tpe=self.sampler == "tpe", timeout_s=timeout_s,
+        return SweepStudy(
+            self.sweep, self.storage, self.study, self.settings(), use_tpe=self.sampler == "tpe",
+            timeout_s=timeout_s,
         )  # fmt: skip
 
     def save(self, folder: Path) -> Path:
-        """Write it into a folder.
+        """Write :data:`DESCRIPTION_FILE` into a folder, without the storage's password.
 
         Raises
         ------
@@ -101,9 +104,10 @@ class SweepDescription:
             It cannot be written.
         """
         sweep = self.sweep
-        arms = [{**asdict(arm), "path": str(arm.path)} for arm in sweep.arms]
         document = {
-            **self.settings(), "arms": arms, "psf": sweep.psf, "simulated": sweep.simulated,
+            **self.settings(),
+            "variants": [{**asdict(one), "path": str(one.path)} for one in sweep.variants],
+            "psf": sweep.psf, "simulated": sweep.simulated,
             "storage": redact_password(self.storage), "study": self.study, "margin": self.margin,
         }  # fmt: skip
         path = folder / DESCRIPTION_FILE
@@ -111,61 +115,102 @@ class SweepDescription:
         return path
 
 
-def _check_limits(sweep: Sweep, key: str, limits: tuple[Any, Any]) -> None:
-    """Refuse a range before anything opens; the configuration knows what is allowed."""
-    if key == "delay":
-        if limits[0] < 0:
-            raise ConfigError(f"{key}: {limits[0]:g}  must not be negative")
-        return
-    path = key if "." in key else f"loop.{key}"
-    for value in limits:
-        text = str(value).lower() if isinstance(value, bool) else value
-        load_text(sweep.config, "sweep", overrides=[f"{path}={text}"])
+def describe_sweep(
+    bench: Bench,
+    folder: Path,
+    variants: Sequence[MatrixVariant],
+    space: tuple[Parameter, ...],
+    design: Design,
+    *,
+    frames: int,
+    metric: str = "peak",
+    sampler: str,
+    margin: float,
+    storage: str | None,
+    study: str = "sweep",
+) -> Procedure[SweepDescription]:
+    """Describe a new sweep, and save its model PSF in the folder if all loops can share one.
+
+    Parameters
+    ----------
+    bench
+        An open bench.
+    folder
+        Of the sweep.
+    variants, space, design, frames, metric
+        See :class:`~escape_hw.runtime.sweep.design.Sweep`.
+    sampler, margin, storage, study
+        See :class:`SweepDescription`; an SQLite file in the folder by default.
+
+    Raises
+    ------
+    ConfigError
+        See :meth:`SweepDescription.validate`.
+    """
+    path, psf = folder / "model_psf.npy", None
+    if all("." not in one.key for one in space):
+        psf = str(path)
+        if not path.is_file():
+            np.save(path, (yield from model_psf(bench)))
+    config = bench.config
+    sweep = Sweep(
+        config.to_toml(), tuple(variants), space, design, frames, config.system.seed, metric, psf,
+        bool(bench.simulated),
+    )  # fmt: skip
+    url = storage or f"sqlite:///{folder / 'study.db'}"
+    return SweepDescription(sweep, url, study, sampler, margin).validate()
+
+
+def _check_limits(sweep: Sweep, parameter: Parameter) -> None:
+    """Check both ends of a range against the configuration's limits, before anything opens."""
+    for value in (parameter.at(0.0), parameter.at(1.0)):
+        if parameter.key == DELAY_KEY:
+            if value < 0:
+                raise ConfigError(f"{DELAY_KEY}: {value:g} must not be negative")
+            continue
+        path = parameter.key if "." in parameter.key else f"loop.{parameter.key}"
+        load_text(sweep.config, "sweep", overrides=[f"{path}={format_value(value)}"])
 
 
 def read_description(folder: Path, storage: str | None = None) -> SweepDescription:
-    """Read what :meth:`SweepDescription.keep` wrote.
+    """Read the description of a sweep.
 
     Parameters
     ----------
     folder
         Of the sweep.
     storage
-        URL of the study, where the kept one will not do: passwords are never written.
+        URL of the study instead of the stored one, which lacks its password.
 
     Raises
     ------
     ConfigError
         The storage has a password, and no URL is given.
     ProductError
-        It is not there or damaged, or a matrix has gone or is another.
+        The description is missing or damaged, or a matrix is missing or has changed.
     """
     path = folder / DESCRIPTION_FILE
     try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-        found = _from_document(document)
+        document = current_keys(json.loads(path.read_text(encoding="utf-8")))
+        variants = tuple(
+            replace(MatrixVariant(**one), path=Path(one["path"])) for one in document["variants"]
+        )
+        sweep = Sweep(
+            document["config"], variants, tuple(map(parse_parameter, document["parameters"])),
+            Design(**document["design"]), document["frames"], document["seed"], document["metric"],
+            document["psf"], document["simulated"],
+        )  # fmt: skip
+        url = document["storage"] if storage is None else storage
+        found = SweepDescription(sweep, url, document["study"], document["sampler"], document["margin"])
     except OSError as error:
         raise ProductError(f"{path}: cannot be read ({error.strerror}); is {folder} a sweep?") from error
     except (ValueError, KeyError, TypeError) as error:
         raise ProductError(f"{path}: damaged ({error})") from error
-    found = found if storage is None else replace(found, storage=storage)
     if ":***@" in found.storage:
-        raise ConfigError(f"{path}: passwords are not kept; give the whole URL again with --storage")
-    for arm in found.sweep.arms:
-        if not arm.path.is_file():
-            raise ProductError(f"{arm.path}: not there; the sweep compares this matrix")
-        if file_sha256(arm.path) != arm.sha256:
-            raise ProductError(f"{arm.path}: it is not the file any more that the sweep began with")
+        raise ConfigError(f"{path}: passwords are not stored; give the whole URL again with --storage")
+    for one in variants:
+        if not one.path.is_file():
+            raise ProductError(f"{one.path}: missing; the sweep compares this matrix")
+        if file_sha256(one.path) != one.sha256:
+            raise ProductError(f"{one.path}: changed since the sweep began")
     return found
-
-
-def _from_document(document: Mapping[str, Any]) -> SweepDescription:
-    arms = tuple(replace(MatrixVariant(**one), path=Path(one["path"])) for one in document["arms"])
-    sweep = Sweep(
-        document["config"], arms, tuple(parse_parameter(text) for text in document["parameters"]),
-        Design(**document["design"]), document["frames"], document["seed"], document["metric"],
-        document["psf"], document["simulated"],
-    )  # fmt: skip
-    return SweepDescription(
-        sweep, document["storage"], document["study"], document["sampler"], document["margin"]
-    )

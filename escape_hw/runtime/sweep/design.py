@@ -1,10 +1,10 @@
-"""Which loops a sweep runs: arms, stages, slots, and the air of each."""
+"""Design of a sweep: matrix variants, search space, stages, and the slot of each loop."""
 
 from __future__ import annotations
 
 import zlib
-from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,29 +12,30 @@ import numpy as np
 
 from escape_hw.runtime.sweep.search_space import Parameter
 
-#: The stages in their order: parameters drawn; the best few of each arm on common air; the winner of each
-#: arm on fresh common air.
+#: The stages in their order: drawn parameters; the best few of each variant on common realisations of the
+#: turbulence; the best of each variant on fresh common realisations.
 EXPLORE, SHORTLIST, FINAL = "explore", "shortlist", "final"
 STAGES = (EXPLORE, SHORTLIST, FINAL)
+#: The Strehl ratios that can be maximised.
+METRICS = ("peak", "otf", "encircled")
 #: Spacing of the stages' seeds.
 _SEED_SPACING = 1_000_000
+#: Names of version 0.1.0 in stored studies and sweep.json, and today's.
+_RENAMED_KEYS = {
+    "arm": "variant", "arms": "variants", "heats": "replicates", "finals": "final_replicates"
+}  # fmt: skip
+
+
+def current_keys(stored: Any) -> Any:
+    """A stored JSON value with the keys of version 0.1.0 replaced by today's."""
+    if isinstance(stored, dict):
+        return {_RENAMED_KEYS.get(key, key): current_keys(value) for key, value in stored.items()}
+    return [current_keys(value) for value in stored] if isinstance(stored, list) else stored
 
 
 @dataclass(frozen=True, slots=True)
 class MatrixVariant:
-    """One of the matrices to compare.
-
-    Parameters
-    ----------
-    matrix
-        How the matrix is called.
-    optical_gains
-        Whether it is scaled by its optical gains.
-    path
-        Its file.
-    sha256
-        The file's checksum.
-    """
+    """One of the matrices to compare: its name, whether optical gains scale it, its file and checksum."""
 
     matrix: str
     optical_gains: bool
@@ -43,89 +44,124 @@ class MatrixVariant:
 
     @property
     def label(self) -> str:
-        """Name of the arm."""
+        """Name of the variant in tables and stored trials."""
         return f"{self.matrix} + OG" if self.optical_gains else self.matrix
 
 
 @dataclass(frozen=True, slots=True)
 class Slot:
-    """Place of one loop in the plan.
+    """Place of one loop in the design.
 
     Parameters
     ----------
     stage
         One of :data:`STAGES`.
-    arm
-        Label of the arm.
+    variant
+        Label of the matrix variant.
     index
-        Number of the air: the same for every arm, and every candidate.
+        Number of the turbulence realisation, common to all variants and candidates.
     candidate
-        Number of the parameters, in the later stages.
+        Number of the parameter set, in the later stages.
     """
 
     stage: str
-    arm: str
+    variant: str
     index: int
     candidate: int = 0
 
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values."""
-        return asdict(self)
-
     def run_seed(self, seed: int) -> int:
-        """Seed of the air and the noise: no two stages share any."""
+        """Seed of turbulence and noise; no two stages share one."""
         return seed + _SEED_SPACING * (1 + STAGES.index(self.stage)) + self.index
 
 
 @dataclass(frozen=True, slots=True)
 class Design:
-    """How many loops there are.
+    """Number of loops in each stage.
 
     Parameters
     ----------
     trials
-        Loops of the first stage over all arms.
-    candidates, heats
-        How many parameters of each arm run again, and on how many stretches of air.
-    finals
-        Stretches of air that the best of each arm run on.
+        Loops of the first stage over all variants.
+    candidates, replicates
+        Parameter sets of each variant in the second stage, and the realisations each one runs on.
+    final_replicates
+        Realisations that the best parameter set of each variant runs on.
     """
 
     trials: int = 200
     candidates: int = 3
-    heats: int = 4
-    finals: int = 20
+    replicates: int = 4
+    final_replicates: int = 20
 
-    def exploration_slots(self, arms: Sequence[MatrixVariant]) -> Iterator[Slot]:
-        """Slots of the first stage: air by air, every arm on each."""
+    def exploration_slots(self, variants: Sequence[MatrixVariant]) -> Iterator[Slot]:
+        """Slots of the first stage: one realisation after the other, each with every variant."""
         for number in range(self.trials):
-            yield Slot(EXPLORE, arms[number % len(arms)].label, number // len(arms))
+            yield Slot(EXPLORE, variants[number % len(variants)].label, number // len(variants))
 
-    def shortlist_slots(self, arms: Sequence[MatrixVariant]) -> Iterator[Slot]:
+    def shortlist_slots(self, variants: Sequence[MatrixVariant]) -> Iterator[Slot]:
         """Slots of the second stage."""
-        for index in range(self.heats):
-            for arm in arms:
+        for index in range(self.replicates):
+            for variant in variants:
                 for candidate in range(self.candidates):
-                    yield Slot(SHORTLIST, arm.label, index, candidate)
+                    yield Slot(SHORTLIST, variant.label, index, candidate)
 
-    def final_slots(self, arms: Sequence[MatrixVariant]) -> Iterator[Slot]:
+    def final_slots(self, variants: Sequence[MatrixVariant]) -> Iterator[Slot]:
         """Slots of the last stage."""
-        for index in range(self.finals):
-            for arm in arms:
-                yield Slot(FINAL, arm.label, index)
+        for index in range(self.final_replicates):
+            for variant in variants:
+                yield Slot(FINAL, variant.label, index)
 
     def n_loops(self, n_variants: int) -> int:
-        """All loops."""
-        return self.trials + n_variants * (self.candidates * self.heats + self.finals)
+        """Loops of all stages."""
+        return self.trials + n_variants * (self.candidates * self.replicates + self.final_replicates)
+
+
+@dataclass(frozen=True, slots=True)
+class Sweep:
+    """What is swept.
+
+    Parameters
+    ----------
+    config
+        The whole configuration, as TOML.
+    variants, space, design
+        What is compared, what is varied, and the number of loops.
+    frames
+        Length of a loop.
+    seed
+        Of the draws and of the turbulence.
+    metric
+        Strehl ratio that is maximised; one of :data:`METRICS`.
+    psf
+        File of the model PSF, or ``None`` when each trial computes its own.
+    simulated
+        Whether each trial opens a simulated bench with its own turbulence.
+    """
+
+    config: str
+    variants: tuple[MatrixVariant, ...]
+    space: tuple[Parameter, ...]
+    design: Design
+    frames: int
+    seed: int
+    metric: str = "peak"
+    psf: str | None = None
+    simulated: bool = True
+
+    def merit(self, outcome: Mapping[str, Any]) -> float | None:
+        """The Strehl ratio that is maximised; ``None`` for a loop that diverged."""
+        if outcome["diverged"] or outcome["strehl"] is None:
+            return None
+        return float(outcome["strehl"][self.metric]["value"])
 
 
 def draw_parameters(space: Sequence[Parameter], seed: int, index: int) -> dict[str, Any]:
-    """Random parameters of a stretch of air: a function of its number alone.
+    """Random parameters of a realisation.
 
-    So every arm gets the same ones, in whatever order and on whatever machine its loop runs.
+    They depend on the seed, the number of the realisation and the key only. All variants therefore run the
+    same parameters on the same turbulence, in whatever order and on whatever machine.
     """
-    values = {}
-    for one in space:
-        own = (seed, index, zlib.crc32(one.key.encode()))
-        values[one.key] = one.at(float(np.random.default_rng(own).random()))
-    return values
+    return {
+        one.key: one.at(float(np.random.default_rng((seed, index, zlib.crc32(one.key.encode()))).random()))
+        for one in space
+    }

@@ -1,10 +1,10 @@
-"""Products of a sweep: JSON document, table of loops, report; finding the result of a finished sweep."""
+"""Products of a sweep: JSON document, table of loops, report; the result of a finished sweep."""
 
 from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -16,76 +16,68 @@ from escape_hw.runtime.procedures.criteria import criterion
 from escape_hw.runtime.procedures.products import write_run_result
 from escape_hw.runtime.session.record import BenchRecord
 from escape_hw.runtime.sweep.description import SweepDescription
-from escape_hw.runtime.sweep.design import EXPLORE, STAGES
+from escape_hw.runtime.sweep.design import EXPLORE, METRICS, STAGES
 from escape_hw.runtime.sweep.result import SweepResult, VariantComparison
-from escape_hw.runtime.sweep.run import METRICS
 from escape_hw.runtime.sweep.study import redact_password
+
+#: File name of the table of loops.
+TRIALS = "trials.csv"
 
 
 def sweep_document(result: SweepResult) -> dict[str, Any]:
-    """What ``result.json`` and ``--json`` tell of a sweep."""
+    """The part of ``result.json`` and ``--json`` that describes the sweep."""
     sweep = result.sweep
-    done = {stage: len(result.stage(stage)) for stage in STAGES}
-    explored = result.stage(EXPLORE)
+    curves: dict[str, dict[str, list[Any]]] = {}
+    for one in sweep.variants:
+        loops = result.stage(EXPLORE, one.label)
+        values = {p.key: [r.values[p.key] for r in loops] for p in sweep.space}
+        curves[one.label] = {"merit": [r.merit for r in loops], **values}
     return {
         "sweep": {
-            "arms": [{**asdict(arm), "label": arm.label, "path": str(arm.path)} for arm in sweep.arms],
+            "variants": [
+                {**asdict(one), "label": one.label, "path": str(one.path)} for one in sweep.variants
+            ],
             "parameters": [one.to_text() for one in sweep.space],
             "design": asdict(sweep.design),
             "frames": sweep.frames,
             "metric": sweep.metric,
-            "loops": done,
+            "loops": {stage: len(result.stage(stage)) for stage in STAGES},
             "diverged": sum(r.merit == 0 for r in result.run.records),
             "margin": result.margin,
             "importance": result.importance,
             "importance_closed": result.importance_closed,
-            "curves": {
-                arm.label: {
-                    "merit": [r.merit for r in explored if r.slot.arm == arm.label],
-                    **{
-                        one.key: [r.values[one.key] for r in explored if r.slot.arm == arm.label]
-                        for one in sweep.space
-                    },
-                }
-                for arm in sweep.arms
-            },
+            "curves": curves,
         },
         "best": {
-            label: {
-                "values": best.values,
-                "strehl": strehl_document(best.strehl),
-                "closed": best.closed,
-                "loops": best.airs,
-            }
+            label: {**asdict(best), "strehl": strehl_document(best.strehl)}
             for label, best in result.best.items()
         },
-        "comparisons": _comparisons(result.comparisons),
-        "at_random": _comparisons(result.at_random),
+        "comparisons": _comparison_rows(result.comparisons),
+        "at_random": _comparison_rows(result.at_random),
         "criteria": [] if result.partial else criteria(result),
         "partial": result.partial,
     }
 
 
-def _comparisons(found: Sequence[VariantComparison]) -> list[dict[str, Any]]:
+def _comparison_rows(found: Sequence[VariantComparison]) -> list[dict[str, Any]]:
     return [
         {"first": one.first, "second": one.second, **asdict(one.found), "text": one.text} for one in found
     ]
 
 
 def criteria(result: SweepResult) -> list[dict[str, Any]]:
-    """Every arm's best loop stays closed; ESCAPE is not below the baseline by more than the margin."""
+    """Every variant's best loops stay closed; ESCAPE is not below the baseline by more than the margin."""
     checks = [
         criterion(
-            f"{label}: at its best, {best.closed} of {best.airs} loops stayed closed",
-            best.closed == best.airs,
+            f"{label}: at its best, {best.closed} of {best.loops} loops stayed closed",
+            best.closed == best.loops,
         )
         for label, best in result.best.items()
     ]
-    sweep = result.sweep
-    labels = [arm.label for arm in sweep.arms]
+    labels = [one.label for one in result.sweep.variants]
     ours = "ESCAPE + OG" if "ESCAPE + OG" in labels else "ESCAPE"
     for one in result.comparisons:
-        if one.first == ours and one.second == labels[0]:
+        if (one.first, one.second) == (ours, labels[0]):
             checks.append(
                 criterion(
                     f"{ours} minus {labels[0]}: at least {100 * one.found.low:+.2f} % Strehl at 95 %, not "
@@ -97,41 +89,28 @@ def criteria(result: SweepResult) -> list[dict[str, Any]]:
 
 
 def trials_csv(result: SweepResult) -> str:
-    """One line per loop: its place in the plan, its parameters, and how it went."""
+    """Table with one line for each loop: its slot, its parameters, and its outcome."""
     keys = [one.key for one in result.sweep.space]
-    ratios = [f"strehl_{way}" for way in METRICS]
-    errors = [f"{name}_sigma" for name in ratios]
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
     table.writerow(
         [
-            "stage",
-            "matrix",
-            "air",
-            "candidate",
-            *keys,
-            *ratios,
-            *errors,
-            "residual_rms_nm",
-            "stable",
-            "diverged",
+            "stage", "matrix", "realisation", "candidate", *keys, *(f"strehl_{name}" for name in METRICS),
+            *(f"strehl_{name}_sigma" for name in METRICS), "residual_rms_nm", "stable", "diverged",
         ]
-    )
+    )  # fmt: skip
     for record in result.run.records:
         slot, out = record.slot, record.outcome
         strehl = out.get("strehl") or {}
         table.writerow(
             [
-                slot.stage, slot.arm, slot.index, slot.candidate, *(record.values[key] for key in keys),
-                *(strehl.get(way, {}).get("value", "") for way in METRICS),
-                *(strehl.get(way, {}).get("sigma", "") for way in METRICS),
+                slot.stage, slot.variant, slot.index, slot.candidate, *(record.values[key] for key in keys),
+                *(strehl.get(name, {}).get("value", "") for name in METRICS),
+                *(strehl.get(name, {}).get("sigma", "") for name in METRICS),
                 out.get("residual_rms_nm", ""), out["stable"], out["diverged"],
             ]
         )  # fmt: skip
     return text.getvalue()
-
-
-TRIALS = "trials.csv"
 
 
 def save_sweep(
@@ -141,14 +120,14 @@ def save_sweep(
     result: SweepResult,
     wall_seconds: float,
 ) -> dict[str, Any]:
-    """Table of all loops, ``result.json`` and report of a sweep.
+    """Save the description, the table of all loops, ``result.json`` and the report of a sweep.
 
-    The folder can be resumed from afterwards, too: its description leads to the same study.
+    The sweep can also be resumed from this folder: its description names the same study.
 
     Returns
     -------
     dict
-        The run's document; its ``criteria`` say what was met.
+        The run's document; its ``criteria`` say which were met.
 
     Raises
     ------
@@ -170,22 +149,22 @@ def save_sweep(
 
 
 def find_finished_result(run: Path, description: SweepDescription) -> dict[str, Any] | None:
-    """The result of a sweep that ran to its end, in its own folder or in one that went on with it.
+    """The result of a finished sweep, from its own folder or from the one it was resumed in.
 
-    A report that has gone is built again.
+    A missing report is built again.
 
     Parameters
     ----------
     run
-        Folder of the sweep that is to be gone on with.
-    kept
-        What it says of itself.
+        Folder of the sweep to resume.
+    description
+        Its description.
 
     Returns
     -------
     dict or None
-        Its ``result.json`` with the folder; ``None`` when there is something left to run, or the folder of
-        the result is not there any more.
+        Its ``result.json`` with the folder; ``None`` when loops are left to run, or the folder of the
+        result was removed.
 
     Raises
     ------
@@ -194,21 +173,19 @@ def find_finished_result(run: Path, description: SweepDescription) -> dict[str, 
     StorageError
         The study's storage does not answer.
     """
-    for folder in _folders(run, description):
-        if not (folder / "result.json").is_file():
-            continue
-        document = read_result(folder)
-        if document.get("partial") or "sweep" not in document:
-            continue
-        if not (folder / REPORT).is_file():
-            write_report(folder)
-        products = {name: str(path) for name, path in document["products"].items()}
-        return {**document, "folder": str(folder.absolute()), "products": products}
-    return None
+    elsewhere = None if _is_finished(run) else description.open_study().result_folder()
+    folder = run if elsewhere is None else Path(elsewhere)
+    if not _is_finished(folder):
+        return None
+    document = read_result(folder)
+    if not (folder / REPORT).is_file():
+        write_report(folder)
+    products = {name: str(path) for name, path in document["products"].items()}
+    return {**document, "folder": str(folder.absolute()), "products": products}
 
 
-def _folders(run: Path, description: SweepDescription) -> Iterator[Path]:
-    yield run
-    elsewhere = description.store().finished_in()
-    if elsewhere is not None:
-        yield Path(elsewhere)
+def _is_finished(folder: Path) -> bool:
+    if not (folder / "result.json").is_file():
+        return False
+    document = read_result(folder)
+    return "sweep" in document and not document.get("partial")

@@ -1,4 +1,4 @@
-"""How a sweep is asked for: what may be varied where, and the sweep as one call. Loads without Optuna."""
+"""Checks of a requested sweep, and a sweep of matrices in memory. Loads without Optuna."""
 
 from __future__ import annotations
 
@@ -19,23 +19,22 @@ from escape_hw.runtime.sweep.search_space import (
 if TYPE_CHECKING:
     from escape_hw.config.system import SystemConfig
     from escape_hw.runtime.session.system import CalibrationLike, System
-    from escape_hw.runtime.sweep.description import SweepDescription
+    from escape_hw.runtime.sweep.design import MatrixVariant
     from escape_hw.runtime.sweep.result import SweepResult
 
-#: Parts of the configuration that the matrices were measured with.
+#: Sections of the configuration that the matrices were measured with.
 _FIXED_SECTIONS = ("system", "sensor", "basis", "devices", "schema")
 
 
 def require_optuna() -> None:
-    """Say what is missing.
+    """Check that the optional packages of a sweep are installed.
 
     Raises
     ------
     ConfigError
         Optuna or scikit-learn is not installed.
     """
-    missing = [name for name in ("optuna", "sklearn") if importlib.util.find_spec(name) is None]
-    if missing:
+    if any(importlib.util.find_spec(name) is None for name in ("optuna", "sklearn")):
         raise ConfigError(
             "a sweep needs Optuna and scikit-learn, which are not installed: "
             "pip install 'escape-hw[sweep]' (in a clone: .venv/bin/pip install --editable '.[sweep]')"
@@ -43,7 +42,7 @@ def require_optuna() -> None:
 
 
 def parse_search_space(config: SystemConfig, texts: Sequence[str]) -> tuple[Parameter, ...]:
-    """What is varied; on hardware everything within limits that a person has set.
+    """The search space; on hardware, only the loop's parameters within given limits.
 
     Parameters
     ----------
@@ -66,32 +65,33 @@ def parse_search_space(config: SystemConfig, texts: Sequence[str]) -> tuple[Para
             )
         if one.key.partition(".")[0] in _FIXED_SECTIONS:
             raise ConfigError(
-                f"--vary {one.key}: the matrices were measured with one; make them anew and compare sweeps"
+                f"--vary {one.key}: the matrices were measured with one value; run a sweep for each value "
+                "and compare them"
             )
         if not config.simulated and one.key not in LOOP_KEYS:
             raise ConfigError(f"--vary {one.key}: on hardware only {', '.join(LOOP_KEYS)} can be varied")
     missing = [key for key in LOOP_KEYS if key not in {one.key for one in given}]
     if not config.simulated and missing:
         raise ConfigError(
-            f"on hardware a person sets the limits of every parameter; missing: {', '.join(missing)} "
-            "(--gain, --leak, --drop LOW:HIGH, or one value that stays)"
+            f"on hardware the limits of every parameter must be given; missing: {', '.join(missing)} "
+            "(--gain, --leak, --dropped-modes LOW:HIGH, or one value that stays)"
         )
     return default_space(config.basis.n_modes, given)
 
 
 def require_loop_frames(config: SystemConfig, frames: int) -> None:
-    """Refuse loops too short for the Strehl ratios that a sweep judges them by.
+    """Refuse loops too short for Strehl ratios with errors.
 
     Raises
     ------
     ConfigError
-        Says how many frames are needed; or there is no science camera.
+        Too few frames, with the least number; or there is no science camera.
     """
     from escape_hw.calibration.loop.runner import SETTLING_S, minimum_strehl_frames
 
     science = config.devices.science
     if science is None:
-        raise ConfigError(f"'{config.system.name}' has no science camera to judge the loops of a sweep by")
+        raise ConfigError(f"'{config.system.name}' has no science camera; a sweep maximises the Strehl ratio")
     least = minimum_strehl_frames(config.devices.wfs.frame_rate_hz, science.frame_rate_hz)
     if frames < least:
         raise ConfigError(
@@ -106,7 +106,7 @@ def run_matrix_sweep(
     matrices: Mapping[str, CalibrationLike],
     folder: Path,
     vary: Sequence[str],
-    asked: Mapping[str, Any],
+    request: Mapping[str, Any],
     *,
     workers: int,
     scheduler: str | None,
@@ -115,68 +115,52 @@ def run_matrix_sweep(
     """A sweep with matrices in memory; see :meth:`~escape_hw.runtime.session.system.System.sweep`."""
     require_optuna()
     space = parse_search_space(bench.config, vary)
-    require_loop_frames(bench.config, asked["frames"])
-    from escape_hw.runtime.sweep.description import DESCRIPTION_FILE, read_description
+    require_loop_frames(bench.config, request["frames"])
+    from escape_hw.runtime.sweep.description import DESCRIPTION_FILE, describe_sweep, read_description
+    from escape_hw.runtime.sweep.design import Design
     from escape_hw.runtime.sweep.result import analyse_sweep
     from escape_hw.runtime.sweep.run import run_sweep
-    from escape_hw.runtime.sweep.workers import DaskWorkers, LocalWorkers
+    from escape_hw.runtime.sweep.workers import open_workers
 
-    description = _prepare_sweep(bench, matrices, folder, space, asked, progress)
-    if (folder / DESCRIPTION_FILE).is_file() and read_description(
-        folder
-    ).settings() == description.settings():
-        description = read_description(folder)
+    folder = folder.absolute()
+    options = dict(request)
+    variants, design = _save_matrices(matrices, folder), Design(trials=options.pop("trials"))
+    description = bench.run(
+        describe_sweep(bench, folder, variants, space, design, **options), progress=progress
+    )
+    if (folder / DESCRIPTION_FILE).is_file():
+        known = read_description(folder)
+        description = known if known.settings() == description.settings() else description
     description.save(folder)
-    if not description.sweep.simulated:
-        return analyse_sweep(
-            description.sweep,
-            bench.run(run_sweep(description.sweep, description.store(), bench), progress=progress),
-        )
-    pool = LocalWorkers(workers) if scheduler is None else DaskWorkers(scheduler)
+    simulated = description.sweep.simulated
+    pool = open_workers(workers, scheduler) if simulated else None
     try:
-        found = bench.run(run_sweep(description.sweep, description.store(), pool), progress=progress)
+        procedure = run_sweep(description.open_study(), pool or bench)
+        found = bench.run(procedure, progress=progress)
     finally:
-        pool.close()
+        if pool is not None:
+            pool.close()
     return analyse_sweep(description.sweep, found, description.margin)
 
 
-def _prepare_sweep(
-    bench: System,
-    matrices: Mapping[str, CalibrationLike],
-    folder: Path,
-    space: tuple[Parameter, ...],
-    asked: Mapping[str, Any],
-    progress: bool,
-) -> SweepDescription:
+def _save_matrices(matrices: Mapping[str, CalibrationLike], folder: Path) -> list[MatrixVariant]:
+    """Save matrices in memory as the variants of a sweep."""
     import numpy as np
 
     from escape_hw.io.fits.matrix import load_matrix, save_matrix
     from escape_hw.io.storage import make_folder
     from escape_hw.runtime.procedures.products import product_key
     from escape_hw.runtime.session.system import as_calibration
-    from escape_hw.runtime.sweep.description import SweepDescription
-    from escape_hw.runtime.sweep.design import Design, MatrixVariant
-    from escape_hw.runtime.sweep.run import Sweep
+    from escape_hw.runtime.sweep.design import MatrixVariant
 
-    folder = folder.absolute()
     make_folder(folder)
-    arms = []
+    variants = []
     for label, given in matrices.items():
         calibration = as_calibration(given)
         path = folder / f"{product_key(label)}.fits"
-        # A file that holds this very matrix stays: its checksum says whether a study goes on.
+        # A file with this matrix is kept: a study is resumed only if the checksums agree.
         existing = load_matrix(path) if path.is_file() else None
         if existing is None or not np.array_equal(existing.matrix.data, calibration.matrix.data):
             existing = load_matrix(save_matrix(path, calibration))
-        arms.append(MatrixVariant(label, False, path, existing.sha256))
-    psf = None
-    if all("." not in one.key for one in space):
-        psf = folder / "model_psf.npy"
-        if not psf.is_file():
-            np.save(psf, bench.take_model_psf(progress=progress))
-    sweep = Sweep(
-        bench.config.to_toml(), tuple(arms), space, Design(trials=asked["trials"]), asked["frames"],
-        bench.config.system.seed, "peak", None if psf is None else str(psf), bench.simulated,
-    )  # fmt: skip
-    storage = asked["storage"] or f"sqlite:///{folder / 'study.db'}"
-    return SweepDescription(sweep, storage, "sweep", asked["sampler"], asked["margin"]).validate()
+        variants.append(MatrixVariant(label, False, path, existing.sha256))
+    return variants

@@ -15,95 +15,42 @@ from optuna.trial import create_trial
 
 from escape_hw.api.results import Estimate, StrehlEstimate
 from escape_hw.pipeline.statistics import MIN_PAIRS, PairedComparison, compare_pairs, describe_comparison
-from escape_hw.runtime.sweep.design import EXPLORE, FINAL, MatrixVariant
-from escape_hw.runtime.sweep.run import METRICS, Sweep, SweepRun
-from escape_hw.runtime.sweep.search_space import Parameter
+from escape_hw.runtime.sweep.design import EXPLORE, FINAL, METRICS, MatrixVariant, Sweep
+from escape_hw.runtime.sweep.run import SweepRun
 from escape_hw.runtime.sweep.study import LoopRecord
 
-#: A parameter that does nothing: what it gets is what chance gives any.
+#: Importance of a dummy parameter without effect: the share that noise gives to any parameter.
 CHANCE = "chance"
-#: Fewer loops tell nothing of this.
+#: Fewest loops for the importance of parameters.
 MIN_LOOPS = 20
-
-
-def importances(
-    records: Sequence[LoopRecord],
-    arms: Sequence[MatrixVariant],
-    space: Sequence[Parameter],
-    seed: int,
-    *,
-    closed_only: bool = False,
-) -> dict[str, float]:
-    """Share of each parameter in the variance of the Strehl ratio (Hutter et al. 2014, by Optuna).
-
-    The matrix counts as a parameter like any other (paper, validation procedure). Loops that diverged
-    count with a Strehl ratio of 0, or not at all.
-
-    Parameters
-    ----------
-    records
-        Finished loops; those of the first stage are taken.
-    arms, space, seed
-        Of the sweep.
-    closed_only
-        Leave out the loops that diverged.
-
-    Returns
-    -------
-    dict
-        By parameter, with :data:`CHANCE`; sums to 1. Empty for fewer than :data:`MIN_LOOPS` loops.
-    """
-    of = {arm.label: arm for arm in arms}
-    selected = [r for r in records if r.slot.stage == EXPLORE and (r.merit > 0 or not closed_only)]
-    if len(selected) < MIN_LOOPS or np.ptp([record.merit for record in selected]) == 0:
-        return {}
-    distributions = {one.key: one.distribution() for one in space}
-    distributions["matrix"] = CategoricalDistribution(tuple(dict.fromkeys(arm.matrix for arm in arms)))
-    if len({arm.optical_gains for arm in arms}) > 1:
-        distributions["optical_gains"] = CategoricalDistribution((False, True))
-    distributions[CHANCE] = FloatDistribution(0.0, 1.0)
-    known = {name: one for name, one in distributions.items() if not one.single()}
-    dummy_values = np.random.default_rng((seed, len(selected))).random(len(selected))
-    study = optuna.create_study(direction="maximize")
-    for record, dummy in zip(selected, dummy_values, strict=True):
-        arm = of[record.slot.arm]
-        values = {
-            **record.values, "matrix": arm.matrix, "optical_gains": arm.optical_gains, CHANCE: float(dummy)
-        }  # fmt: skip
-        params = {name: values[name] for name in known}
-        study.add_trial(create_trial(params=params, distributions=known, value=record.merit))
-    found = get_param_importances(study, evaluator=FanovaImportanceEvaluator(seed=seed % 2**31))
-    return {name: float(share) for name, share in found.items()}
-
-
-#: Difference in the Strehl ratio that does not matter, unless told otherwise: one percent, below what
-#: vibrations do from run to run on the paper's bench.
+#: Largest difference in the Strehl ratio that counts as equivalent, by default: one percent, less than
+#: vibrations cause between runs on the paper's bench.
 DEFAULT_MARGIN = 0.01
 
 
 @dataclass(frozen=True, slots=True)
 class BestLoops:
-    """An arm at its own best parameters.
+    """A variant at its own best parameters.
 
     Parameters
     ----------
     values
         The parameters.
     strehl
-        Mean over the stretches of air of the last stage, with its standard error over them.
-    closed, airs
+        Mean over the realisations of the last stage, with its standard error over them.
+    closed, loops
         Loops that stayed closed, and all.
     """
 
     values: dict[str, Any]
     strehl: StrehlEstimate
     closed: int
-    airs: int
+    loops: int
 
 
 @dataclass(frozen=True, slots=True)
 class VariantComparison:
-    """Two arms on the same air; ``found`` is about first minus second."""
+    """Two variants on the same turbulence; ``found`` is about first minus second."""
 
     first: str
     second: str
@@ -113,11 +60,11 @@ class VariantComparison:
 
 @dataclass(frozen=True, slots=True)
 class SweepResult:
-    """Everything a sweep found.
+    """Result of a sweep.
 
-    ``comparisons`` are between arms at their own best parameters, ``at_random`` between arms at the same
-    random ones, where both loops were stable; ``importance`` counts diverged loops with a Strehl ratio
-    of 0, ``importance_closed`` leaves them out.
+    ``comparisons`` are between variants at their own best parameters, ``at_random`` between variants at
+    the same random ones, where both loops were stable; ``importance`` counts diverged loops with a Strehl
+    ratio of 0, ``importance_closed`` leaves them out.
     """
 
     sweep: Sweep
@@ -130,9 +77,9 @@ class SweepResult:
     importance_closed: dict[str, float] = field(default_factory=dict)
 
     def __repr__(self) -> str:
-        arms = ", ".join(arm.label for arm in self.sweep.arms)
+        labels = ", ".join(one.label for one in self.sweep.variants)
         state = ", PARTIAL" if self.partial else ""
-        lines = [f"{type(self).__name__} of {len(self.run.records)} loops: {arms}{state}"]
+        lines = [f"{type(self).__name__} of {len(self.run.records)} loops: {labels}{state}"]
         lines += [
             f"{label}: Strehl ratio {best.strehl.peak.value:.3f} ± {best.strehl.peak.sigma:.3f} at its best"
             for label, best in self.best.items()
@@ -144,87 +91,117 @@ class SweepResult:
         """Whether the operator stopped it."""
         return self.run.partial
 
-    def stage(self, stage: str, arm: str | None = None) -> list[LoopRecord]:
-        """Finished loops of a stage, of one arm or all."""
-        return [r for r in self.run.records if r.slot.stage == stage and (arm is None or r.slot.arm == arm)]
+    def stage(self, stage: str, variant: str | None = None) -> list[LoopRecord]:
+        """Finished loops of a stage, of one variant or all."""
+        return [
+            r for r in self.run.records
+            if r.slot.stage == stage and (variant is None or r.slot.variant == variant)
+        ]  # fmt: skip
 
 
 def analyse_sweep(sweep: Sweep, run: SweepRun, margin: float = DEFAULT_MARGIN) -> SweepResult:
-    """Draw the conclusions of a sweep, as far as its loops go.
+    """Best parameters, comparisons and importances from the loops of a sweep.
 
     Parameters
     ----------
     sweep, run
-        What was run, and what came of it.
+        The sweep and its loops.
     margin
-        Difference in the Strehl ratio that does not matter.
+        Largest difference in the Strehl ratio that counts as equivalent.
     """
     best = {}
-    for arm in sweep.arms:
-        final = [r for r in run.records if r.slot.stage == FINAL and r.slot.arm == arm.label]
+    for variant in sweep.variants:
+        final = [r for r in run.records if (r.slot.stage, r.slot.variant) == (FINAL, variant.label)]
         if final:
-            best[arm.label] = _summarise_final(final)
-    pairs = list(_pairs(sweep.arms))
-    final_of = _by_realisation(r for r in run.records if r.slot.stage == FINAL)
-    explored_of = _by_realisation(r for r in run.records if r.slot.stage == EXPLORE and r.outcome["stable"])
-    same = _same_parameters(run.records)
+            best[variant.label] = _summarise_final(final)
+    explored = [r for r in run.records if r.slot.stage == EXPLORE]
+    parameters: dict[int, dict[str, Any]] = {}
+    # Random parameters are the same for all variants on the same turbulence, those of TPE are not.
+    same = all(parameters.setdefault(r.slot.index, r.values) == r.values for r in explored)
+    at_random = [r for r in explored if r.outcome["stable"]] if same else []
     return SweepResult(
         sweep, run, margin, best,
-        tuple(_compare_pairs(pairs, final_of, margin)),
-        tuple(_compare_pairs(pairs, explored_of, margin)) if same else (),
-        importances(run.records, sweep.arms, sweep.space, sweep.seed),
-        importances(run.records, sweep.arms, sweep.space, sweep.seed, closed_only=True),
+        tuple(_comparisons(sweep, [r for r in run.records if r.slot.stage == FINAL], margin)),
+        tuple(_comparisons(sweep, at_random, margin)),
+        importances(sweep, run.records), importances(sweep, run.records, closed_only=True),
     )  # fmt: skip
 
 
 def _summarise_final(final: Sequence[LoopRecord]) -> BestLoops:
-    closed = [r for r in final if r.merit > 0]
     strehls = []
-    for way in METRICS:
-        # A loop that diverged has no image worth the name.
-        values = np.array([r.outcome["strehl"][way]["value"] if r.merit > 0 else 0.0 for r in final])
+    for metric in METRICS:
+        values = np.array([r.outcome["strehl"][metric]["value"] if r.merit > 0 else 0.0 for r in final])
         sigma = float(values.std(ddof=1) / math.sqrt(values.size)) if values.size > 1 else math.nan
         strehls.append(Estimate(float(values.mean()), sigma))
-    return BestLoops(final[0].values, StrehlEstimate(*strehls), len(closed), len(final))
+    n_closed = sum(r.merit > 0 for r in final)
+    return BestLoops(final[0].values, StrehlEstimate(*strehls), n_closed, len(final))
 
 
-def _pairs(arms: Sequence[MatrixVariant]) -> Iterable[tuple[str, str]]:
-    """Every arm against the first, and every matrix with its optical gains against itself without."""
-    for arm in arms[1:]:
-        yield arm.label, arms[0].label
-    for arm in arms[1:]:
-        for other in arms[1:]:
-            if arm.matrix == other.matrix and arm.optical_gains and not other.optical_gains:
-                yield arm.label, other.label
-    rest = [arm.label for arm in arms[1:] if arm.optical_gains == arms[0].optical_gains]
-    yield from zip(rest[1:], rest, strict=False)
+def _pairs(variants: Sequence[MatrixVariant]) -> Iterable[tuple[str, str]]:
+    """Every variant and the first, every matrix with and without its optical gains, and neighbours."""
+    first, *others = variants
+    for one in others:
+        yield one.label, first.label
+    for one in others:
+        for other in others:
+            if one.matrix == other.matrix and one.optical_gains and not other.optical_gains:
+                yield one.label, other.label
+    alike = [one.label for one in others if one.optical_gains == first.optical_gains]
+    yield from zip(alike[1:], alike, strict=False)
 
 
-def _by_realisation(records: Iterable[LoopRecord]) -> dict[str, dict[int, float]]:
-    found: dict[str, dict[int, float]] = {}
+def _comparisons(sweep: Sweep, records: Iterable[LoopRecord], margin: float) -> Iterable[VariantComparison]:
+    """Comparisons of the variants on their common realisations."""
+    merits: dict[str, dict[int, float]] = {one.label: {} for one in sweep.variants}
     for record in records:
-        found.setdefault(record.slot.arm, {})[record.slot.index] = record.merit
-    return found
-
-
-def _same_parameters(records: Sequence[LoopRecord]) -> bool:
-    """Whether all arms ran the same parameters on the same air, as random ones are drawn."""
-    seen: dict[int, dict[str, Any]] = {}
-    for record in records:
-        if (
-            record.slot.stage == EXPLORE
-            and seen.setdefault(record.slot.index, record.values) != record.values
-        ):
-            return False
-    return True
-
-
-def _compare_pairs(
-    pairs: Sequence[tuple[str, str]], merits: dict[str, dict[int, float]], margin: float
-) -> Iterable[VariantComparison]:
-    for first, second in pairs:
-        a, b = merits.get(first, {}), merits.get(second, {})
+        merits[record.slot.variant][record.slot.index] = record.merit
+    for first, second in _pairs(sweep.variants):
+        a, b = merits[first], merits[second]
         common = sorted(set(a) & set(b))
         if len(common) >= MIN_PAIRS:
             found = compare_pairs(np.array([a[n] for n in common]), np.array([b[n] for n in common]))
             yield VariantComparison(first, second, found, describe_comparison(first, second, found, margin))
+
+
+def importances(
+    sweep: Sweep, records: Sequence[LoopRecord], *, closed_only: bool = False
+) -> dict[str, float]:
+    """Share of each parameter in the variance of the Strehl ratio (fANOVA, Hutter et al. 2014, by Optuna).
+
+    The matrix counts as a parameter (paper, validation procedure).
+
+    Parameters
+    ----------
+    sweep, records
+        The sweep and its finished loops; those of the first stage are used.
+    closed_only
+        Leave out the loops that diverged; otherwise they count with a Strehl ratio of 0.
+
+    Returns
+    -------
+    dict
+        By parameter, with :data:`CHANCE`; sums to 1. Empty for fewer than :data:`MIN_LOOPS` loops.
+    """
+    variants, seed = sweep.variants, sweep.seed
+    variant_of = {one.label: one for one in variants}
+    selected = [r for r in records if r.slot.stage == EXPLORE and (r.merit > 0 or not closed_only)]
+    if len(selected) < MIN_LOOPS or np.ptp([record.merit for record in selected]) == 0:
+        return {}
+    distributions = {one.key: one.distribution() for one in sweep.space}
+    distributions["matrix"] = CategoricalDistribution(tuple(dict.fromkeys(one.matrix for one in variants)))
+    if len({one.optical_gains for one in variants}) > 1:
+        distributions["optical_gains"] = CategoricalDistribution((False, True))
+    distributions[CHANCE] = FloatDistribution(0.0, 1.0)
+    known = {name: one for name, one in distributions.items() if not one.single()}
+    dummy_values = np.random.default_rng((seed, len(selected))).random(len(selected))
+    study = optuna.create_study(direction="maximize")
+    for record, dummy in zip(selected, dummy_values, strict=True):
+        variant = variant_of[record.slot.variant]
+        values = {
+            **record.values, "matrix": variant.matrix, "optical_gains": variant.optical_gains,
+            CHANCE: float(dummy),
+        }  # fmt: skip
+        params = {name: values[name] for name in known}
+        study.add_trial(create_trial(params=params, distributions=known, value=record.merit))
+    found = get_param_importances(study, evaluator=FanovaImportanceEvaluator(seed=seed % 2**31))
+    return {name: float(share) for name, share in found.items()}

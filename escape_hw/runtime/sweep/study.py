@@ -1,137 +1,56 @@
-"""The Optuna study of a sweep: parameter sampling, distribution and storage of trials."""
+"""The Optuna study of a sweep: which loops wait, run and are finished, in a storage that runners share."""
 
 from __future__ import annotations
 
+import contextlib
+import functools
+import itertools
 import logging
 import os
 import socket
+import threading
 import time
-import uuid
+import warnings
 import zlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from datetime import datetime
-from typing import Any, TypeVar
+from typing import Any, Concatenate, ParamSpec, TypeVar
 
 import optuna
-from optuna.distributions import BaseDistribution
-from optuna.exceptions import StorageInternalError, UpdateFinishedTrialError
-from optuna.samplers import BaseSampler, TPESampler
+from optuna.exceptions import ExperimentalWarning, StorageInternalError, UpdateFinishedTrialError
+from optuna.samplers import TPESampler
 from optuna.trial import FrozenTrial, TrialState, create_trial
 from sqlalchemy import event, make_url
 from sqlalchemy.exc import ArgumentError, DBAPIError
 
-from escape_hw.errors import ConfigError, StorageError
-from escape_hw.runtime.sweep.design import EXPLORE, MatrixVariant, Slot, draw_parameters
+from escape_hw.errors import CalibrationError, ConfigError, EscapeError, StorageError
+from escape_hw.runtime.sweep.design import EXPLORE, Slot, Sweep, current_keys, draw_parameters
 from escape_hw.runtime.sweep.search_space import Parameter, Range
+
+log = logging.getLogger(__name__)
+P = ParamSpec("P")
+T = TypeVar("T")
 
 #: The samplers by name.
 SAMPLERS = ("random", "tpe")
-#: Loops of each arm with drawn parameters before TPE has anything to learn from.
+#: Loops of each variant with drawn parameters before TPE starts.
 N_STARTUP_LOOPS = 10
-
-#: What is known of an arm: parameters and merit of its finished loops.
-History = Sequence[tuple[dict[str, Any], float]]
-
-
-class SlotSampler(BaseSampler):
-    """Gives each trial the parameters that belong to its place in the plan.
-
-    ``random`` draws them by the number of the air, so that every arm runs the same ones on the same air.
-    ``tpe`` learns from the arm's own loops: every matrix is led to its own best parameters, none by
-    another's.
-
-    Parameters
-    ----------
-    space
-        What is varied.
-    seed
-        Of the whole sweep.
-    slot_of
-        Place of a trial in the plan.
-    history
-        Finished loops of an arm; ``None``: parameters are drawn.
-    """
-
-    def __init__(
-        self,
-        space: Sequence[Parameter],
-        seed: int,
-        slot_of: Callable[[FrozenTrial], Slot],
-        history: Callable[[str], History] | None,
-    ) -> None:
-        self._space, self._seed, self._slot_of, self._history = tuple(space), seed, slot_of, history
-        self._values_of_trial: dict[int, dict[str, Any]] = {}
-
-    def infer_relative_search_space(
-        self, study: optuna.Study, trial: FrozenTrial
-    ) -> dict[str, BaseDistribution]:
-        """Nothing: all parameters of a trial are chosen together when the first is asked for."""
-        return {}
-
-    def sample_relative(
-        self, study: optuna.Study, trial: FrozenTrial, search_space: dict[str, BaseDistribution]
-    ) -> dict[str, Any]:
-        """Nothing; see :meth:`infer_relative_search_space`."""
-        return {}
-
-    def sample_independent(
-        self,
-        study: optuna.Study,
-        trial: FrozenTrial,
-        param_name: str,
-        param_distribution: BaseDistribution,
-    ) -> Any:
-        """One parameter."""
-        if trial.number not in self._values_of_trial:
-            # Those of a trial are asked for in a row.
-            self._values_of_trial = {trial.number: self._values(self._slot_of(trial))}
-        return self._values_of_trial[trial.number][param_name]
-
-    def _values(self, slot: Slot) -> dict[str, Any]:
-        history = () if self._history is None else self._history(slot.arm)
-        if self._history is None or min(len(history), slot.index) < N_STARTUP_LOOPS:
-            return draw_parameters(self._space, self._seed, slot.index)
-        distributions = {one.key: one.distribution() for one in self._space}
-        seed = zlib.crc32(f"{self._seed} {slot.arm} {slot.index}".encode())
-        variant_study = optuna.create_study(
-            direction="maximize", sampler=TPESampler(seed=seed, multivariate=True, n_startup_trials=0)
-        )
-        variant_study.add_trials(
-            create_trial(state=TrialState.COMPLETE, params=params, distributions=distributions, value=merit)
-            for params, merit in history
-        )
-        return dict(variant_study.ask(distributions).params)
-
-
-log = logging.getLogger(__name__)
-T = TypeVar("T")
-
-#: Seconds after which a runner that has not been heard of counts as dead, and its trials run again.
-HEARTBEAT_TIMEOUT_S = 60.0
-#: Seconds between two signs of life.
-HEARTBEAT_S = 5.0
+#: Seconds between two heartbeats of a running trial, and without one until the trial is run again.
+HEARTBEAT_S, GRACE_PERIOD_S = 5, 30
 #: Seconds to wait for a storage that does not answer.
 STORAGE_TIMEOUT_S = 120.0
-#: Trials laid out ahead of the runners: every one costs time at each claim.
-_QUEUE_LENGTH = 24
 _FINISHED = (TrialState.COMPLETE, TrialState.PRUNED)
+
+#: Runs the loop of a slot; returns its outcome and its merit, ``None`` when it diverged.
+RunLoop = Callable[[Slot, dict[str, Any]], tuple[dict[str, Any], float | None]]
 
 
 @dataclass(frozen=True, slots=True)
 class LoopRecord:
-    """A finished loop.
+    """A finished loop: slot, parameters, outcome, and the Strehl ratio that is maximised, 0 if it diverged.
 
-    Parameters
-    ----------
-    slot
-        Its place in the plan.
-    values
-        Its parameters.
-    outcome
-        How it went, see :func:`~escape_hw.runtime.sweep.trials.loop_outcome`.
-    merit
-        The Strehl ratio that is maximised; 0 for a loop that diverged.
+    See :func:`~escape_hw.runtime.sweep.trials.loop_outcome`.
     """
 
     slot: Slot
@@ -140,237 +59,315 @@ class LoopRecord:
     merit: float
 
 
-@dataclass(frozen=True, slots=True)
-class Claim:
-    """A trial that this runner owns until it tells its outcome."""
-
-    trial: optuna.Trial
-    slot: Slot
-    values: dict[str, Any]
+class _SlotTaken(Exception):
+    """The trial's loop is finished, or runs elsewhere, or cannot run."""
 
 
-class SweepStore:
-    """The trials of one sweep.
+class _Storage(optuna.storages.RDBStorage):
+    """Storage whose heartbeats go on after it did not answer for a while."""
 
-    Several runners on several machines may share one: a trial is handed out once. A runner gives a sign
-    of life every :data:`HEARTBEAT_S` seconds; what a dead one had claimed is handed out again. When the
-    storage does not answer, calls wait for it up to ``timeout_s``.
+    def record_heartbeat(self, trial_id: int) -> None:
+        with contextlib.suppress(StorageInternalError, DBAPIError):
+            super().record_heartbeat(trial_id)
+
+
+def _retried(
+    method: Callable[Concatenate[SweepStudy, P], T],
+) -> Callable[Concatenate[SweepStudy, P], T]:
+    """The method, called again while the storage does not answer."""
+
+    @functools.wraps(method)
+    def call(self: SweepStudy, /, *arguments: P.args, **keywords: P.kwargs) -> T:
+        return self._retry(lambda: method(self, *arguments, **keywords))
+
+    return call
+
+
+class SweepStudy:
+    """The trials of one sweep, one for each :class:`~escape_hw.runtime.sweep.design.Slot`.
+
+    Several runners on several machines may share one. Optuna hands each enqueued trial to one of them,
+    records heartbeats while :meth:`run_next` runs it, and fails it when they stop, after which it is
+    enqueued again with a new number: loops are identified by the slot in their user attributes. Every call
+    waits up to ``timeout_s`` for a storage that does not answer.
 
     Parameters
     ----------
+    sweep
+        Its loops have heartbeats in simulation. On hardware one runner uses :meth:`ask` and :meth:`tell`.
     url
-        As SQLAlchemy takes it: ``sqlite:////path/study.db``, ``postgresql+psycopg://user@host/name``.
-    study
+        SQLAlchemy's URL: ``sqlite:////path/study.db``, ``postgresql+psycopg://user@host/name``.
+    name
         Name of the study.
     settings
-        What makes two sweeps the same; a study that was begun with others is refused.
-    arms, space, seed
-        What is compared, what is varied, and the seed of the draws.
-    learn
+        Settings that must agree to resume a study.
+    use_tpe
         TPE instead of random parameters.
-    patience_s
+    timeout_s
         Seconds to wait for a storage that does not answer.
 
     Raises
     ------
     ConfigError
-        The study exists with other settings, or the URL means nothing.
+        The study exists with other settings, or the URL is invalid.
     StorageError
         The storage does not answer.
     """
 
     def __init__(
         self,
+        sweep: Sweep,
         url: str,
-        study: str,
+        name: str,
         settings: Mapping[str, Any],
-        arms: Sequence[MatrixVariant],
-        space: Sequence[Parameter],
-        seed: int,
         *,
         use_tpe: bool = False,
         timeout_s: float = STORAGE_TIMEOUT_S,
     ) -> None:
-        self.url, self.name, self._timeout_s = url, study, timeout_s
-        self._variants, self._space = {arm.label: arm for arm in arms}, tuple(space)
-        self._matrices = tuple(dict.fromkeys(arm.matrix for arm in arms))
-        self.runner = f"{socket.gethostname()}:{os.getpid()}:{uuid.uuid4().hex[:8]}"
-        self._last_heartbeat = -HEARTBEAT_S
-        optuna.logging.set_verbosity(optuna.logging.WARNING)
-        sampler = SlotSampler(space, seed, _slot_of, self._history if use_tpe else None)
-        self._study = self._retry_until_timeout(lambda: _open_study(url, study, sampler))
+        self.sweep, self.url, self.name, self._timeout_s = sweep, url, name, timeout_s
+        self._use_tpe, self._grace_s = use_tpe, GRACE_PERIOD_S if sweep.simulated else 0
+        self._stopped = threading.Event()
+        optuna.logging.set_verbosity(optuna.logging.ERROR)
+        # Optuna announces the interface of its heartbeats as experimental, from several threads.
+        warnings.filterwarnings("ignore", ".*(heartbeat|fail_stale_trials)", ExperimentalWarning)
+        self._study = self._retry(lambda: _open_study(url, name, sweep.simulated))
         self._check_settings(dict(settings))
-        self.send_heartbeat()
 
-    # ------------------------------------------------------------------ hand out and take in
-    def enqueue_slots(self, plan: Sequence[Slot], values: Mapping[tuple[str, int], Mapping[str, Any]]) -> int:
-        """Put the next slots of a plan up for claiming; returns how many are neither finished nor laid out.
+    def stop(self) -> None:
+        """End the wait for a storage that does not answer, in every thread."""
+        self._stopped.set()
+
+    # ------------------------------------------------------------------ run loops
+    @_retried
+    def enqueue_missing(
+        self, plan: Sequence[Slot], values: Mapping[tuple[str, int], Mapping[str, Any]], n_free: int
+    ) -> tuple[int, int]:
+        """Enqueue the next loops of a stage; trials of runners that died count as missing.
+
+        Loops of the first stage get random parameters, or those that TPE chooses from the finished ones.
 
         Parameters
         ----------
         plan
-            Every slot of a stage.
+            Every slot of the stage.
         values
-            Parameters by arm and candidate, where the stage fixes them.
+            Parameters by variant and candidate, in the later stages.
+        n_free
+            Length of the queue that the runner can start at once.
+
+        Returns
+        -------
+        n_unfinished, n_waiting : int
+            Slots of the stage without a finished loop, and trials in the queue.
         """
-        return self._retry_until_timeout(lambda: self._enqueue_slots(plan, values))
+        self._fail_abandoned()
+        trials = [t for t in self._study.get_trials(deepcopy=False) if "slot" in t.user_attrs]
+        finished = {_slot_of(t) for t in trials if t.state in _FINISHED}
+        present = finished | {_slot_of(t) for t in trials if t.state != TrialState.FAIL}
+        n_waiting = sum(t.state == TrialState.WAITING for t in trials)
+        missing = (slot for slot in plan if slot not in present)
+        for slot in itertools.islice(missing, max(0, n_free - n_waiting)):
+            variant = next(one for one in self.sweep.variants if one.label == slot.variant)
+            parameters = values.get((slot.variant, slot.candidate)) or self._choose_parameters(slot)
+            fixed = {"matrix": variant.matrix, "optical_gains": variant.optical_gains, **parameters}
+            self._study.enqueue_trial(fixed, user_attrs={"slot": asdict(slot)})
+            n_waiting += 1
+        return sum(slot not in finished for slot in plan), n_waiting
 
-    def _enqueue_slots(
-        self, plan: Sequence[Slot], values: Mapping[tuple[str, int], Mapping[str, Any]]
-    ) -> int:
-        trials = self._study.get_trials(deepcopy=False)
-        alive = [t for t in trials if t.state != TrialState.FAIL and "slot" in t.user_attrs]
-        present = {_slot_of(t) for t in alive}
-        missing = [slot for slot in plan if slot not in present]
-        waiting = sum(t.state == TrialState.WAITING for t in alive)
-        if waiting > _QUEUE_LENGTH // 2:
-            return len(missing)
-        for slot in missing[: _QUEUE_LENGTH - waiting]:
-            arm = self._variants[slot.arm]
-            fixed = {"matrix": arm.matrix, "optical_gains": arm.optical_gains}
-            fixed |= values.get((slot.arm, slot.candidate), {})
-            self._study.enqueue_trial(fixed, user_attrs={"slot": slot.to_dict()})
-        return max(0, len(missing) - (_QUEUE_LENGTH - waiting))
+    def _choose_parameters(self, slot: Slot) -> dict[str, Any]:
+        """Parameters of a loop of the first stage; TPE optimises each variant for itself."""
+        if not self._use_tpe or slot.index < N_STARTUP_LOOPS:
+            return draw_parameters(self.sweep.space, self.sweep.seed, slot.index)
+        history = [r for r in self.records() if r.slot.stage == EXPLORE and r.slot.variant == slot.variant]
+        if len(history) < N_STARTUP_LOOPS:
+            return draw_parameters(self.sweep.space, self.sweep.seed, slot.index)
+        distributions = {one.key: one.distribution() for one in self.sweep.space}
+        seed = zlib.crc32(f"{self.sweep.seed} {slot.variant} {slot.index}".encode())
+        tpe = TPESampler(seed=seed, multivariate=True, n_startup_trials=0)
+        study = optuna.create_study(direction="maximize", sampler=tpe)
+        study.add_trials(
+            create_trial(params=r.values, distributions=distributions, value=r.merit) for r in history
+        )
+        return dict(study.ask(distributions).params)
 
-    def claim(self) -> Claim | None:
-        """A trial to run, or ``None`` when none is up for claiming."""
-        return self._retry_until_timeout(self._claim)
-
-    def _claim(self) -> Claim | None:
-        if not self._study.get_trials(deepcopy=False, states=(TrialState.WAITING,)):
-            return None
-        trial = self._study.ask()
-        if "slot" not in trial.user_attrs:
-            # Another runner took the last one, and Optuna made a new one.
-            self._study.tell(trial, state=TrialState.FAIL)
-            return None
-        trial.set_user_attr("runner", self.runner)
-        slot = Slot(**trial.user_attrs["slot"])
-        trial.suggest_categorical("matrix", self._matrices)
-        trial.suggest_categorical("optical_gains", (False, True))
-        values = {one.key: _suggest_value(trial, one) for one in self._space}
-        return Claim(trial, slot, values)
-
-    def finish(self, claim: Claim, outcome: Mapping[str, Any], merit: float | None) -> None:
-        """Keep how a claimed trial went; ``merit`` is ``None`` when it diverged."""
-        state = TrialState.COMPLETE if merit is not None else TrialState.PRUNED
-        self._retry_until_timeout(lambda: self._tell(claim, state, merit, outcome=dict(outcome)))
-
-    def release(self, claim: Claim, reason: str) -> None:
-        """Give up a claimed trial, so that it can be handed out again."""
-        self._retry_until_timeout(lambda: self._tell(claim, TrialState.FAIL, None, reason=reason))
-
-    def _tell(self, claim: Claim, state: TrialState, merit: float | None, **remarks: Any) -> None:
-        try:
-            for key, value in remarks.items():
-                claim.trial.set_user_attr(key, value)
-        except UpdateFinishedTrialError:
-            # Told before the connection broke, or given up by another runner that took this one for dead.
-            return
-        self._study.tell(claim.trial, merit, state=state, skip_if_finished=True)
-
-    # ------------------------------------------------------------------ signs of life
-    def send_heartbeat(self) -> None:
-        """Give a sign of life when it is time, and recover what dead runners had claimed."""
-        if time.monotonic() - self._last_heartbeat < HEARTBEAT_S:
-            return
-        self._last_heartbeat = time.monotonic()
-        self._retry_until_timeout(self._send_heartbeat)
-
-    def _send_heartbeat(self) -> None:
-        self._study.set_user_attr(f"alive:{self.runner}", time.time())
-        seen = {k[6:]: float(v) for k, v in self._study.user_attrs.items() if k.startswith("alive:")}
+    def _fail_abandoned(self) -> None:
+        """Fail running trials whose heartbeats stopped, and those that never had any (0.1.0, hardware)."""
+        optuna.storages.fail_stale_trials(self._study)
         for trial in self._study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)):
-            runner = trial.user_attrs.get("runner")
-            if runner is None:
-                began = trial.datetime_start or datetime.now()
-                dead = (datetime.now() - began).total_seconds() > HEARTBEAT_TIMEOUT_S
-            else:
-                dead = runner != self.runner and _is_runner_dead(runner, seen.get(runner, 0.0))
-            if dead:
-                log.warning("trial %d: its runner %s is gone; it runs again", trial.number, runner)
+            age = datetime.now() - (trial.datetime_start or datetime.min)
+            if "host" not in trial.user_attrs and age.total_seconds() >= self._grace_s:
+                log.warning("trial %d was abandoned; its loop runs again", trial.number)
                 self._study.tell(trial.number, state=TrialState.FAIL, skip_if_finished=True)
 
-    # ------------------------------------------------------------------ what is known
-    def running(self) -> int:
-        """Trials that some runner is at."""
-        return self._retry_until_timeout(lambda: len(self._study.get_trials(False, (TrialState.RUNNING,))))
+    def run_next(self, run_loop: RunLoop) -> None:
+        """Run the next trial of the queue with :meth:`optuna.Study.optimize`; returns at once without one.
 
+        May be called from several threads. Exceptions of ``run_loop`` fail the trial and are raised.
+        """
+        overtaken = False
+
+        def objective(trial: optuna.Trial) -> float:
+            nonlocal overtaken
+            try:
+                trial.set_user_attr("host", f"{socket.gethostname()}:{os.getpid()}")
+                slot, values = self._suggest(trial)
+                outcome, merit = run_loop(slot, values)
+                trial.set_user_attr("outcome", outcome)
+            except UpdateFinishedTrialError:
+                overtaken = True
+                raise
+            if merit is None:
+                raise optuna.TrialPruned("the loop diverged")
+            return merit
+
+        def optimize() -> None:
+            if not self._study.get_trials(deepcopy=False, states=(TrialState.WAITING,)):
+                return
+            try:
+                self._study.optimize(objective, n_trials=1, catch=(_SlotTaken,))
+            except ValueError:
+                # The trial was failed for want of heartbeats; its loop runs again under another number.
+                if not overtaken:
+                    raise
+
+        self._retry(optimize)
+
+    def _suggest(self, trial: optuna.Trial) -> tuple[Slot, dict[str, Any]]:
+        trials = self._study.get_trials(deepcopy=False)
+        fixed = trials[trial.number].system_attrs.get("fixed_params", {})
+        if "slot" not in trial.user_attrs or not {one.key for one in self.sweep.space} <= set(fixed):
+            # Made by Optuna after another runner took the last one, or enqueued without parameters by 0.1.0.
+            raise _SlotTaken
+        slot = _slot_of(trials[trial.number])
+        for other in trials:
+            earlier = other.state == TrialState.RUNNING and other.number < trial.number
+            if (
+                (earlier or other.state in _FINISHED)
+                and "slot" in other.user_attrs
+                and _slot_of(other) == slot
+            ):
+                raise _SlotTaken
+        matrices = tuple(dict.fromkeys(one.matrix for one in self.sweep.variants))
+        trial.suggest_categorical("matrix", matrices)
+        trial.suggest_categorical("optical_gains", (False, True))
+        return slot, {one.key: _suggest_value(trial, one) for one in self.sweep.space}
+
+    @_retried
+    def ask(self) -> tuple[optuna.Trial, Slot, dict[str, Any]] | None:
+        """Take the next trial of the queue, for a procedure that cannot run within :meth:`run_next`."""
+        trial = self._study.ask()
+        try:
+            return (trial, *self._suggest(trial))
+        except _SlotTaken:
+            self.tell(trial, None)
+            return None
+
+    @_retried
+    def tell(self, trial: optuna.Trial, outcome: dict[str, Any] | None, merit: float | None = None) -> None:
+        """Store the outcome of a trial from :meth:`ask`; without one, its loop runs again.
+
+        Raises
+        ------
+        CalibrationError
+            Another runner uses the study.
+        """
+        state = TrialState.FAIL if outcome is None else TrialState.PRUNED if merit is None else None
+        try:
+            if outcome is not None:
+                trial.set_user_attr("outcome", outcome)
+        except UpdateFinishedTrialError:
+            # Stored just before the connection broke, or failed by another runner.
+            if self._study.get_trials(deepcopy=False)[trial.number].state == TrialState.FAIL:
+                raise CalibrationError(
+                    "another runner took over the study; one bench serves one sweep: end the other"
+                ) from None
+        self._study.tell(trial, merit, state=state, skip_if_finished=True)
+
+    # ------------------------------------------------------------------ results
+    @_retried
     def records(self) -> list[LoopRecord]:
-        """Every finished loop, in the order of the plan's numbers; doubles only once."""
+        """Every finished loop once, in the order of the design."""
         found: dict[Slot, LoopRecord] = {}
-        for trial in self._retry_until_timeout(lambda: self._study.get_trials(deepcopy=False)):
-            if trial.state in _FINISHED and "slot" in trial.user_attrs:
-                slot = _slot_of(trial)
-                found.setdefault(slot, self._record(trial, slot))
+        for trial in self._study.get_trials(deepcopy=False, states=_FINISHED):
+            if "slot" in trial.user_attrs:
+                slot, values = _slot_of(trial), {one.key: trial.params[one.key] for one in self.sweep.space}
+                merit = trial.value if trial.state == TrialState.COMPLETE else None
+                found.setdefault(slot, LoopRecord(slot, values, trial.user_attrs["outcome"], merit or 0.0))
         return sorted(found.values(), key=lambda r: (r.slot.stage, r.slot.index, r.slot.candidate))
 
-    def finished_in(self) -> str | None:
-        """Folder with the result of all its loops, once there is one."""
-        return self._retry_until_timeout(lambda: self._study.user_attrs.get("finished_in"))
+    @_retried
+    def result_folder(self) -> str | None:
+        """Folder with the result of the complete sweep; ``None`` before there is one."""
+        return self._study.user_attrs.get("finished_in")
 
+    @_retried
     def set_result_folder(self, folder: str) -> None:
-        """Keep where the result of all its loops lies."""
-        self._retry_until_timeout(lambda: self._study.set_user_attr("finished_in", folder))
+        """Store the folder with the result of the complete sweep."""
+        self._study.set_user_attr("finished_in", folder)
 
-    def _record(self, trial: FrozenTrial, slot: Slot) -> LoopRecord:
-        values = {one.key: trial.params[one.key] for one in self._space}
-        complete = trial.state == TrialState.COMPLETE and trial.value is not None
-        return LoopRecord(
-            slot, values, trial.user_attrs["outcome"], float(trial.value or 0.0) if complete else 0.0
-        )
-
-    def _history(self, arm: str) -> History:
-        records_of_variant = [r for r in self.records() if r.slot.stage == EXPLORE and r.slot.arm == arm]
-        return [(record.values, record.merit) for record in records_of_variant]
-
-    # ------------------------------------------------------------------ the storage itself
+    # ------------------------------------------------------------------ storage
+    @_retried
     def _check_settings(self, settings: dict[str, Any]) -> None:
-        known = self._retry_until_timeout(lambda: self._study.user_attrs.get("settings"))
+        known = current_keys(self._study.user_attrs.get("settings"))
         if known is None:
-            self._retry_until_timeout(lambda: self._study.set_user_attr("settings", settings))
+            self._study.set_user_attr("settings", settings)
             return
         other = [key for key in settings if known.get(key) != settings[key]]
         if other:
             raise ConfigError(
-                f"study '{self.name}' in {redact_password(self.url)} was begun with another {', '.join(other)}; "
-                "take them again, or another --study or --storage"
+                f"study '{self.name}' in {redact_password(self.url)} has other settings: {', '.join(other)}; "
+                "use the same ones, or another --study or --storage"
             )
 
-    def _retry_until_timeout(self, call: Callable[[], T]) -> T:
-        """A call to the storage, again and again while it does not answer."""
-        deadline, delay_s = time.monotonic() + self._timeout_s, 0.5
+    def _retry(self, call: Callable[[], T]) -> T:
+        """Call the storage, again after growing delays while it does not answer."""
+        deadline, delay_s = None, 0.5
         while True:
             try:
                 return call()
-            except (StorageInternalError, DBAPIError) as error:
-                cause = error.__cause__ if isinstance(error, StorageInternalError) else error.orig
-                if time.monotonic() + delay_s > deadline:
+            except Exception as error:
+                cause = None if isinstance(error, EscapeError) else _storage_error(error)
+                if cause is None:
+                    raise
+                deadline = time.monotonic() + self._timeout_s if deadline is None else deadline
+                if time.monotonic() + delay_s > deadline or self._stopped.wait(delay_s):
                     raise StorageError(
-                        f"the study's storage {redact_password(self.url)} does not answer for {self._timeout_s:.0f} s "
-                        f"({str(cause).strip().splitlines()[0] if str(cause) else error!r}); finished trials "
-                        "are kept there: bring it up again and resume"
+                        f"the study's storage {redact_password(self.url)} does not answer for "
+                        f"{self._timeout_s:.0f} s ({str(cause).strip().splitlines()[0]}); finished trials "
+                        "are kept: resume when it is back"
                     ) from error
-                log.warning("the study's storage does not answer (%s); trying again", cause)
-                time.sleep(delay_s)
                 delay_s = min(2 * delay_s, 5.0)
 
 
+def _storage_error(error: BaseException | None) -> BaseException | None:
+    """The cause of an error of the storage, also where Optuna failed later because of it; else ``None``."""
+    while error is not None:
+        if isinstance(error, StorageInternalError):
+            return error.__cause__ or error
+        if isinstance(error, DBAPIError):
+            return error.orig or error
+        error = error.__cause__ or error.__context__
+    return None
+
+
 def redact_password(url: str) -> str:
-    """A storage's URL without its password, for messages and files."""
+    """A storage's URL without its password."""
     try:
         return make_url(url).render_as_string(hide_password=True)
     except ArgumentError:
         return url
 
 
-def _open_study(url: str, name: str, sampler: SlotSampler) -> optuna.Study:
+def _open_study(url: str, name: str, heartbeat: bool) -> optuna.Study:
     # A locked file is waited for; a connection that a restarted server has cut is noticed.
     options: dict[str, Any] = {"pool_pre_ping": True}
     if url.startswith("sqlite"):
         options["connect_args"] = {"timeout": 60}
     try:
-        storage = optuna.storages.RDBStorage(url, engine_kwargs=options)
+        storage = _Storage(
+            url, engine_kwargs=options, heartbeat_interval=HEARTBEAT_S if heartbeat else None,
+            grace_period=GRACE_PERIOD_S,
+        )  # fmt: skip
     except (ImportError, ValueError, ArgumentError) as error:
         raise ConfigError(
             f"--storage {redact_password(url)}: {error}; it is of the form sqlite:////path/study.db or "
@@ -379,19 +376,17 @@ def _open_study(url: str, name: str, sampler: SlotSampler) -> optuna.Study:
     if url.startswith("sqlite"):
         event.listen(storage.engine, "connect", _enable_write_ahead_log)
         storage.engine.dispose()
-    return optuna.create_study(
-        storage=storage, study_name=name, sampler=sampler, direction="maximize", load_if_exists=True
-    )
+    return optuna.create_study(storage=storage, study_name=name, direction="maximize", load_if_exists=True)
 
 
 def _enable_write_ahead_log(connection: Any, _record: object) -> None:
-    """A log written ahead: a commit outlives the process at once, and costs no wait for the disk."""
+    """Commits survive the end of the process and do not wait for the disk."""
     connection.execute("PRAGMA journal_mode=WAL")
     connection.execute("PRAGMA synchronous=NORMAL")
 
 
 def _slot_of(trial: FrozenTrial) -> Slot:
-    return Slot(**trial.user_attrs["slot"])
+    return Slot(**current_keys(trial.user_attrs["slot"]))
 
 
 def _suggest_value(trial: optuna.Trial, one: Parameter) -> Any:
@@ -400,16 +395,3 @@ def _suggest_value(trial: optuna.Trial, one: Parameter) -> Any:
     if one.integer:
         return trial.suggest_int(one.key, int(one.low), int(one.high))
     return trial.suggest_float(one.key, one.low, one.high, log=one.log)
-
-
-def _is_runner_dead(runner: str, seen: float) -> bool:
-    """Whether a runner is gone: its process, where that can be asked, or its signs of life."""
-    host, pid, _ = runner.rsplit(":", 2)
-    if host == socket.gethostname():
-        try:
-            os.kill(int(pid), 0)
-        except ProcessLookupError:
-            return True
-        except PermissionError:
-            pass
-    return time.time() - seen > HEARTBEAT_TIMEOUT_S

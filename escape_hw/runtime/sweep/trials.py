@@ -1,4 +1,4 @@
-"""One loop of a sweep, as a process of its own runs it."""
+"""One closed loop of a sweep, in a worker process or on an open bench."""
 
 from __future__ import annotations
 
@@ -23,15 +23,16 @@ from escape_hw.config.system import SystemConfig
 from escape_hw.errors import CalibrationError, IncompatibleProduct
 from escape_hw.io.documents import strehl_document
 from escape_hw.runtime.procedures.calibration import model_psf
+from escape_hw.runtime.sweep.design import Slot, Sweep
 from escape_hw.runtime.sweep.search_space import DELAY_KEY, config_overrides
 
-#: A bench and what its twins share belong to one thread; a Dask worker may have several.
+#: A bench and what its simulated devices share belong to one thread; a Dask worker may have several.
 _bench_lock = threading.Lock()
 
 
 @dataclass(frozen=True, slots=True)
 class TrialSpec:
-    """All that one loop needs, small enough to travel.
+    """Everything that a worker needs for one loop.
 
     Parameters
     ----------
@@ -40,14 +41,14 @@ class TrialSpec:
     matrix, sha256
         File of the matrix and its checksum.
     psf
-        File of the model PSF (``.npy``); ``None``: the trial takes one of its own, because what it varies
-        may change it.
+        File of the model PSF (``.npy``). ``None``: the trial computes its own, because a parameter may
+        change it.
     values
         The parameters by key.
     frames
         Length of the loop.
     run_seed
-        Seed of air and noise on twins; ``None`` on hardware.
+        Seed of turbulence and noise in simulation; ``None`` on hardware.
     """
 
     config: str
@@ -58,6 +59,14 @@ class TrialSpec:
     frames: int
     run_seed: int | None
 
+    @classmethod
+    def from_slot(cls, sweep: Sweep, slot: Slot, values: dict[str, Any]) -> TrialSpec:
+        """The loop of a slot."""
+        variant = next(one for one in sweep.variants if one.label == slot.variant)
+        seed = slot.run_seed(sweep.seed) if sweep.simulated else None
+        path, sha256 = str(variant.path), variant.sha256
+        return cls(sweep.config, path, sha256, sweep.psf, values, sweep.frames, seed)
+
     def build_config(self) -> SystemConfig:
         """The configuration of this trial.
 
@@ -67,8 +76,8 @@ class TrialSpec:
             A varied key does not exist, or a value is out of its range.
         """
         overrides = list(config_overrides(self.values))
-        config = load_text(self.config, "sweep", overrides=overrides)
         if self.values.get(DELAY_KEY):
+            config = load_text(self.config, "sweep", overrides=overrides)
             latency = config.twin.latency_s + self.values[DELAY_KEY] / config.devices.wfs.frame_rate_hz
             overrides.append(f"twin.latency_s={latency!r}")
         if self.run_seed is not None:
@@ -76,46 +85,43 @@ class TrialSpec:
         return load_text(self.config, "sweep", overrides=overrides)
 
 
-def run_trial(task: TrialSpec) -> dict[str, Any]:
-    """Open the twins, close the loop, and tell how it went.
+def run_trial(spec: TrialSpec) -> dict[str, Any]:
+    """Open the simulated bench and close the loop.
 
     Returns
     -------
     dict
-        Of plain values, see :func:`loop_outcome`. A loop that cannot even be closed (a singular matrix, no
-        light) counts as one that diverged, and ``notes`` say why.
+        See :func:`loop_outcome`. A loop that cannot be closed (singular matrix, no light) counts as
+        diverged; ``notes`` hold the reason.
     """
     disable_helper_threads()
-    with _bench_lock, Bench.from_config(task.build_config()) as bench:
+    with _bench_lock, Bench.from_config(spec.build_config()) as bench:
         try:
-            return run(run_closed_loop(bench, task))
+            return run(run_closed_loop(bench, spec))
         except CalibrationError as error:
             return {"strehl": None, "stable": False, "diverged": True, "notes": [str(error)]}
 
 
-def run_closed_loop(bench: Bench, task: TrialSpec) -> Procedure[dict[str, Any]]:
-    """The loop on an open bench.
+def run_closed_loop(bench: Bench, spec: TrialSpec) -> Procedure[dict[str, Any]]:
+    """Close the loop of a trial on an open bench; see :func:`loop_outcome`.
 
     Raises
     ------
     CalibrationError
-        The matrix cannot be inverted, or the light has gone: on hardware a reason to stop.
+        The matrix cannot be inverted, or the light was lost.
     """
-    matrix, grid = _load_matrix(task.matrix, task.sha256)
-    if task.psf is None:
-        psf = yield from model_psf(bench)
-    else:
-        psf = _load_psf(task.psf)
-    values = task.values
+    matrix, grid = _load_matrix(spec.matrix, spec.sha256)
+    psf = (yield from model_psf(bench)) if spec.psf is None else _load_psf(spec.psf)
+    values = spec.values
     result = yield from close_loop(
         bench, matrix, grid, gain=float(values["gain"]), leak=float(values["leak"]),
-        dropped_modes=int(values["dropped_modes"]), frames=task.frames, model_psf=psf, stage="trial",
+        dropped_modes=int(values["dropped_modes"]), frames=spec.frames, model_psf=psf, stage="trial",
     )  # fmt: skip
     return loop_outcome(result)
 
 
 def loop_outcome(result: LoopResult) -> dict[str, Any]:
-    """What a sweep keeps of a loop, as plain values."""
+    """The part of a loop's result that is stored in the study, as JSON values."""
     return {
         "strehl": strehl_document(result.strehl),
         "stable": bool(result.stable),
@@ -134,7 +140,7 @@ def _load_matrix(path: str, sha256: str) -> tuple[InteractionMatrix, SensorGeome
 
     product = load_matrix(path)
     if product.sha256 != sha256:
-        raise IncompatibleProduct(f"{path}: it is not the file any more that the sweep began with")
+        raise IncompatibleProduct(f"{path}: changed since the sweep began")
     return product.matrix, product.grid
 
 

@@ -1,165 +1,191 @@
-"""Where a sweep's trials run: processes here, or workers of a Dask scheduler."""
+"""Workers that run the loops of a sweep: processes on this computer, or the workers of a Dask scheduler."""
 
 from __future__ import annotations
 
 import importlib
 import logging
-import multiprocessing
 import os
-import signal
 import threading
 import time
-from concurrent.futures import CancelledError, Executor, Future, ProcessPoolExecutor
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator
+from concurrent.futures import CancelledError, Executor, Future, wait
 from concurrent.futures.process import BrokenProcessPool
-from typing import Any, Protocol
+from contextlib import contextmanager
+from typing import Any, TypeVar
 
-from escape_hw.api.concurrency import disable_helper_threads
 from escape_hw.errors import CalibrationError, ConfigError
-from escape_hw.runtime.sweep.trials import TrialSpec, run_trial
+from escape_hw.runtime.host.processes import open_process_pool, terminate_pool
 
 log = logging.getLogger(__name__)
+T = TypeVar("T")
 
-#: One thread for every library of a worker: there are as many workers as cores.
+#: Environment of the workers: one thread for every library, because there is one worker per core.
 SINGLE_THREAD_VARIABLES = {
     name: "1" for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 }
-#: Seconds to wait for a Dask scheduler that has gone.
+#: Seconds to wait for a Dask scheduler that does not answer.
 SCHEDULER_TIMEOUT_S = 120.0
+#: How often one call may lose its worker.
+_MAX_DEATHS = 4
+#: Seconds between two looks at the connection to a scheduler.
+_POLL_S = 1.0
 
 
-class Workers(Protocol):
-    """Runs trials somewhere else."""
+class Workers(ABC):
+    """Runs functions elsewhere, again on a new worker when one dies. May be used from several threads."""
+
+    #: Exceptions of a future whose worker died.
+    _lost_errors: tuple[type[BaseException], ...] = (CancelledError,)
+
+    def __init__(self) -> None:
+        self._lock, self._closed = threading.Lock(), False
+        self._executor = self._open_executor()
 
     @property
+    @abstractmethod
     def count(self) -> int:
-        """Trials that run at a time."""
-        ...
+        """Functions that run at a time."""
 
-    def submit(self, task: TrialSpec) -> Future[dict[str, Any]]:
-        """Run a trial."""
-        ...
+    @abstractmethod
+    def _open_executor(self) -> Executor: ...
 
-    def is_lost(self, future: Future[dict[str, Any]]) -> bool:
-        """Whether an ended future says nothing of its trial: who ran it has died."""
-        ...
+    @abstractmethod
+    def _close_executor(self) -> None: ...
 
-    @property
-    def is_disconnected(self) -> bool:
-        """Whether nobody is left who could end a future."""
-        ...
+    def submit(self, function: Callable[..., T], *arguments: Any) -> Future[T]:
+        """Run a function on a worker, once."""
+        return self._executor.submit(function, *arguments)
 
-    def restart(self) -> None:
-        """Replace what has died; futures from before are worthless."""
-        ...
+    def _is_disconnected(self) -> bool:
+        """Whether the executor can no longer end its futures."""
+        return False
+
+    def run(self, function: Callable[..., T], *arguments: Any) -> T:
+        """Run a function on a worker and return its result; its exceptions are raised here.
+
+        Raises
+        ------
+        CalibrationError
+            Its workers died several times in a row, or the pool was closed.
+        """
+        for _ in range(_MAX_DEATHS + 1):
+            try:
+                with self._lock:
+                    if self._closed:
+                        raise CalibrationError("the workers are closed")
+                    executor = self._executor
+                    future = self.submit(function, *arguments)
+                while not wait((future,), timeout=_POLL_S).done:
+                    if executor is not self._executor or self._is_disconnected():
+                        raise CancelledError
+                return future.result()
+            except self._lost_errors:
+                self._replace(executor)
+        raise CalibrationError(
+            "the workers die again and again (killed, or out of memory); run fewer of them and resume: "
+            "finished trials are kept"
+        )
+
+    def _replace(self, executor: Executor) -> None:
+        """Open a new executor, unless another thread has done so since."""
+        with self._lock:
+            if self._executor is executor and not self._closed:
+                log.warning("a worker died; what it ran is run again")
+                self._close_executor()
+                self._executor = self._open_executor()
 
     def close(self) -> None:
         """End the workers at once."""
-        ...
+        # Set before the lock is taken, so that a thread that waits for a scheduler gives up.
+        closed_before, self._closed = self._closed, True
+        with self._lock:
+            if not closed_before:
+                self._close_executor()
 
 
-class LocalWorkers:
+class LocalWorkers(Workers):
     """Processes on this computer.
 
     Parameters
     ----------
     count
-        How many.
+        Number of processes.
     """
 
+    _lost_errors = (CancelledError, BrokenProcessPool)
+    _executor: Any
+
     def __init__(self, count: int) -> None:
-        self.count = count
-        self._pool = self._make_pool()
-
-    def _make_pool(self) -> ProcessPoolExecutor:
-        context = multiprocessing.get_context("spawn")
-        return ProcessPoolExecutor(self.count, mp_context=context, initializer=_initialise_worker)
-
-    def submit(self, task: TrialSpec) -> Future[dict[str, Any]]:
-        """Run a trial; one that cannot even be handed over is lost."""
-        # Libraries read these when they are loaded, which a new process does after it has begun.
-        before = {name: os.environ.get(name) for name in SINGLE_THREAD_VARIABLES}
-        os.environ.update(SINGLE_THREAD_VARIABLES)
-        try:
-            return self._pool.submit(run_trial, task)
-        except BrokenProcessPool as error:
-            future: Future[dict[str, Any]] = Future()
-            future.set_exception(error)
-            return future
-        finally:
-            for name, value in before.items():
-                if value is None:
-                    os.environ.pop(name, None)
-                else:
-                    os.environ[name] = value
-
-    def is_lost(self, future: Future[dict[str, Any]]) -> bool:
-        """See :class:`Workers`."""
-        return future.cancelled() or isinstance(future.exception(), BrokenProcessPool)
+        self._count = count
+        super().__init__()
 
     @property
-    def is_disconnected(self) -> bool:
-        """See :class:`Workers`; a pool that breaks ends its futures itself."""
-        return False
-
-    def restart(self) -> None:
+    def count(self) -> int:
         """See :class:`Workers`."""
-        self.close()
-        self._pool = self._make_pool()
+        return self._count
 
-    def close(self) -> None:
+    def _open_executor(self) -> Executor:
+        return open_process_pool(self._count)
+
+    def submit(self, function: Callable[..., T], *arguments: Any) -> Future[T]:
         """See :class:`Workers`."""
-        # Python 3.14 has a method for it.
-        processes = list((getattr(self._pool, "_processes", None) or {}).values())
-        self._pool.shutdown(wait=False, cancel_futures=True)
-        for process in processes:
-            process.terminate()
+        # Numerical libraries read these variables when a new process loads them.
+        with _environment(SINGLE_THREAD_VARIABLES):
+            return super().submit(function, *arguments)
+
+    def _close_executor(self) -> None:
+        terminate_pool(self._executor)
 
 
-class DaskWorkers:
+class DaskWorkers(Workers):
     """Workers of a Dask scheduler, on any number of machines that see the matrices' files.
 
     Parameters
     ----------
     address
         Such as ``tcp://host:8786``.
-    patience_s
-        Seconds to wait for a scheduler that has gone.
+    timeout_s
+        Seconds to wait for a scheduler that does not answer.
 
     Raises
     ------
     ConfigError
         Dask is not installed.
     CalibrationError
-        There is no scheduler.
+        No scheduler answers.
     """
 
     def __init__(self, address: str, timeout_s: float = SCHEDULER_TIMEOUT_S) -> None:
         try:
-            self._dask: Any = importlib.import_module("distributed")
+            dask: Any = importlib.import_module("distributed")
         except ImportError:
             raise ConfigError("--scheduler needs Dask's distributed: pip install 'escape-hw[dask]'") from None
-        self.address, self._timeout_s = address, timeout_s
-        self._client: Any = None
-        self._executor: Executor | None = None
-        self._connect()
+        self.address, self._timeout_s, self._dask = address, timeout_s, dask
+        self._lost_errors = (
+            CancelledError, dask.KilledWorker, dask.comm.CommClosedError, dask.client.ClosedClientError,
+            dask.client.FutureCancelledError,
+        )  # fmt: skip
+        super().__init__()
 
     @property
     def count(self) -> int:
-        """Trials that run at a time: one per worker thread, at least one."""
+        """Number of worker threads, at least one."""
         try:
             return max(1, int(sum(self._client.nthreads().values())))
-        except (OSError, ValueError, RuntimeError, CancelledError):
+        except (OSError, ValueError, RuntimeError, CancelledError, AttributeError):
+            # Another thread is connecting anew; a client without a connection has no scheduler.
             return 1
 
-    def _connect(self) -> None:
+    def _open_executor(self) -> Executor:
         deadline = time.monotonic() + self._timeout_s
         while True:
             try:
                 self._client = self._dask.Client(self.address, timeout=5, set_as_default=False)
-                self._executor = self._client.get_executor(pure=False)
-                return
+                executor: Executor = self._client.get_executor(pure=False)
+                return executor
             except (OSError, TimeoutError) as error:
-                if time.monotonic() > deadline:
+                if self._closed or time.monotonic() > deadline:
                     raise CalibrationError(
                         f"no Dask scheduler answers at {self.address} for {self._timeout_s:.0f} s; start one "
                         "(dask scheduler) and workers (dask worker --nthreads 1), then resume"
@@ -167,53 +193,27 @@ class DaskWorkers:
                 log.warning("no Dask scheduler at %s; trying again", self.address)
                 time.sleep(1.0)
 
-    def submit(self, task: TrialSpec) -> Future[dict[str, Any]]:
-        """Run a trial."""
-        if self._executor is None:
-            raise RuntimeError("the workers are closed")
-        try:
-            return self._executor.submit(run_trial, task)
-        except self._dask.client.ClosedClientError as error:
-            future: Future[dict[str, Any]] = Future()
-            future.set_exception(error)
-            return future
+    def _is_disconnected(self) -> bool:
+        return self._client.status in ("closing", "closed")
 
-    def is_lost(self, future: Future[dict[str, Any]]) -> bool:
-        """See :class:`Workers`."""
-        if future.cancelled():
-            return True
-        gone = (
-            self._dask.KilledWorker, self._dask.comm.CommClosedError, self._dask.client.ClosedClientError,
-            self._dask.client.FutureCancelledError, CancelledError,
-        )  # fmt: skip
-        return isinstance(future.exception(), gone)
-
-    @property
-    def is_disconnected(self) -> bool:
-        """See :class:`Workers`."""
-        return self._client is None or self._client.status in ("closing", "closed")
-
-    def restart(self) -> None:
-        """See :class:`Workers`."""
-        self.close()
-        self._connect()
-
-    def close(self) -> None:
-        """See :class:`Workers`."""
-        client, self._client, self._executor = self._client, None, None
-        if client is not None:
-            client.close(timeout=2)
+    def _close_executor(self) -> None:
+        self._client.close(timeout=2)
 
 
-def _initialise_worker() -> None:
-    """A new worker process: Ctrl-C is the parent's business, and without a parent there is none."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    disable_helper_threads()
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        threading.Thread(target=_exit_with_parent, args=(parent,), daemon=True).start()
+@contextmanager
+def _environment(variables: dict[str, str]) -> Iterator[None]:
+    before = {name: os.environ.get(name) for name in variables}
+    os.environ.update(variables)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
 
 
-def _exit_with_parent(parent: Any) -> None:
-    parent.join()
-    os._exit(1)
+def open_workers(count: int, scheduler: str | None) -> Workers:
+    """Processes on this computer, or the workers of a Dask scheduler when its address is given."""
+    return LocalWorkers(count) if scheduler is None else DaskWorkers(scheduler)

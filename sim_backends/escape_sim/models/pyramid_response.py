@@ -18,10 +18,10 @@ from escape_sim.optics.pyramid import Prism, frequencies
 
 
 @njit(cache=True, fastmath=True, nogil=True)
-def _shifted_spread(spread, row, column, light, out):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """``out[i, j] = conj(spread[row - i, column - j]) light[i, j]``."""
+def _shifted_kernel(kernel, row, column, light, out):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """``out[i, j] = conj(kernel[row - i, column - j]) light[i, j]``."""
     for i in range(light.shape[0]):
-        line, amplitude, target = spread[row - i], light[i], out[i]
+        line, amplitude, target = kernel[row - i], light[i], out[i]
         for j in range(amplitude.size):
             target[j] = line[column - j].conjugate() * amplitude[j]
 
@@ -61,7 +61,7 @@ class ModulatedCorrelations:
 class TurbulentCorrelations:
     """Correlations of a modulation under turbulence: one convolution with the coherence per pixel.
 
-    ``light`` is the pupil amplitude ``(n, n)``, ``spread`` the point response from :func:`_spread`,
+    ``light`` is the pupil amplitude ``(n, n)``, ``kernel`` the point response from :func:`_prism_kernel`,
     ``mean`` the :func:`coherence`, to which ``variation`` is added where the phase varies more. Not
     thread-safe.
     """
@@ -69,19 +69,19 @@ class TurbulentCorrelations:
     def __init__(
         self,
         light: NDArray[np.float32],
-        spread: NDArray[np.complex64],
+        kernel: NDArray[np.complex64],
         mean: NDArray[np.complex128],
         variation: CoherenceVariation | None = None,
     ) -> None:
         self._filter = _convolution(mean, len(light))
-        self._light, self._spread, self._variation = light, spread, variation
+        self._light, self._kernel, self._variation = light, kernel, variation
         self._variation_filter = None if variation is None else _convolution(variation.difference, len(light))
 
     def correlations(self, pixels: NDArray[np.intp]) -> Iterator[NDArray[np.complex64]]:
         """Yield ``n`` rows of ``n`` or more samples for each (row, column) ``u`` in ``pixels``."""
         n, filter_, variation_filter = len(self._light), self._filter, self._variation_filter
         for row, column in pixels:
-            _shifted_spread(self._spread, n - 1 + row, n - 1 + column, self._light, filter_.field)
+            _shifted_kernel(self._kernel, n - 1 + row, n - 1 + column, self._light, filter_.field)
             filter_.run()
             result = filter_.result[:n, :n]
             if variation_filter is not None and self._variation is not None:
@@ -147,14 +147,14 @@ _SIGNS = np.array([[-1, -1], [1, -1], [-1, 1], [1, 1]], np.float32)
 
 
 @njit(cache=True, fastmath=True, nogil=True)
-def _add_pixel_response(spread, row, column, light, correlations, spans, weights, sums):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Add ``-2 Im(spread light correlations)``, by ``weights``, to ``sums (3, n, n)``: x, y and total.
+def _add_pixel_response(kernel, row, column, light, correlations, spans, weights, sums):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Add ``-2 Im(kernel light correlations)``, by ``weights``, to ``sums (3, n, n)``: x, y and total.
 
     Returns the intensity of the pixel: the sum of the real part.
     """
     intensity = np.float64(0)
     for i in range(light.shape[0]):
-        line, field, amplitude = spread[row - i], correlations[i], light[i]
+        line, field, amplitude = kernel[row - i], correlations[i], light[i]
         to_x, to_y, to_total = sums[0, i], sums[1, i], sums[2, i]
         power = np.float32(0)
         for j in range(spans[i, 0], spans[i, 1]):
@@ -266,7 +266,7 @@ def slope_response(
         np.zeros((3, len(pixels_xy))),
         np.zeros((len(pixels_xy) if local else _WORKERS, m, m), np.float32),
     )
-    spread = _spread(prism, len(light), n_grid)
+    kernel = _prism_kernel(prism, len(light), n_grid)
     correlations: list[PixelCorrelations]
     if structure is None:
         correlations = [ModulatedCorrelations(light, prism, n_grid, modulation)] * _WORKERS
@@ -274,8 +274,8 @@ def slope_response(
         mean, variation = _mean_and_varying_coherence(
             len(light), prism.diameter, modulation, structure, nonuniform
         )
-        correlations = [TurbulentCorrelations(light, spread, mean, variation) for _ in range(_WORKERS)]
-    task = _ResponseTask(spread, light, _spans(light), first_samples, samples, interpolation, sums)
+        correlations = [TurbulentCorrelations(light, kernel, mean, variation) for _ in range(_WORKERS)]
+    task = _ResponseTask(kernel, light, _spans(light), first_samples, samples, interpolation, sums)
     parts = np.array_split(np.arange(len(pixels_xy)), _WORKERS)
     # Each worker multiplies matrices on its own thread.
     with limit_to_one_thread(), ThreadPoolExecutor(_WORKERS) as pool:
@@ -335,7 +335,7 @@ class _Sums:
 class _ResponseTask:
     """Inputs and outputs shared by the workers of :func:`slope_response`."""
 
-    spread: NDArray[np.complex64]
+    kernel: NDArray[np.complex64]
     light: NDArray[np.float32]
     spans: NDArray[np.intp]
     first_samples: NDArray[np.intp]
@@ -356,7 +356,7 @@ class _ResponseTask:
                 row, column = pixels_xy[i] + (n - 1)
                 signs = _SIGNS[i // (s * s)]
                 light = _add_pixel_response(
-                    self.spread, row, column, self.light, correlations, self.spans, signs, sums
+                    self.kernel, row, column, self.light, correlations, self.spans, signs, sums
                 )
                 out.light[:, k] += signs[0] * light, signs[1] * light, light
             out.phase_derivatives[:, k] = self._to_nodes(sums[:2])
@@ -377,7 +377,7 @@ def _spans(light: NDArray[np.float32]) -> NDArray[np.intp]:
     return np.stack(lit_columns(np.asarray(light > 0)), axis=1)
 
 
-def _spread(prism: Prism, n: int, n_grid: int) -> NDArray[np.complex64]:
+def _prism_kernel(prism: Prism, n: int, n_grid: int) -> NDArray[np.complex64]:
     """Field at ``u`` of a point at ``p``, for ``u - p`` from ``1 - n`` to ``n_grid - 1`` along y and x."""
     mask = np.fft.ifft2(prism.mask(n_grid))
     steps = np.arange(1 - n, n_grid)

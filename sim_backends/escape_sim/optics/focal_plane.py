@@ -13,14 +13,10 @@ class FocalPlane:
 
     Parameters
     ----------
-    amplitude
-        Pupil amplitude ``(n, n)``.
-    diameter_px
-        Pupil diameter in pupil samples.
-    wavelength_m
-        Wavelength in metres.
-    psf_px
-        lambda/D in camera pixels.
+    amplitude, diameter_px
+        Pupil amplitude ``(n, n)``, and pupil diameter in samples.
+    wavelength_m, psf_px
+        Wavelength in metres, and lambda/D in camera pixels.
     shape
         Region (rows, columns); the optical axis is on pixel ``(rows // 2, columns // 2)``.
     """

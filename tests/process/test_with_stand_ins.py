@@ -1,4 +1,4 @@
-"""``escape rehearse``: a command in hardware mode, with the real drivers, on the simulated bench."""
+"""``escape with-stand-ins``: a command in hardware mode, with the real drivers, on the simulated bench."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def test_a_calibration_in_hardware_mode_on_the_simulated_bench(escape, system: P
         "calibrate", system, "--mode", "hardware", "--set", REGION, "--frames", 50, "--quiet", "--json",
         "--out", tmp_path / "run",
     )  # fmt: skip
-    done = escape("rehearse", system, "--set", REGION, "--", "escape", *calibrate)
+    done = escape("with-stand-ins", system, "--set", REGION, "--", "escape", *calibrate)
     document = json.loads(done.stdout)
     assert done.returncode == 0, done.stderr
     assert document["simulated"] is True
@@ -44,8 +44,8 @@ def test_a_calibration_in_hardware_mode_on_the_simulated_bench(escape, system: P
 
 
 def test_the_commands_exit_code_is_passed_on(escape, system: Path) -> None:
-    assert escape("rehearse", system, "--", sys.executable, "-c", "raise SystemExit(3)").returncode == 3
-    missing = escape("rehearse", system, "--", "no-such-command")
+    assert escape("with-stand-ins", system, "--", sys.executable, "-c", "raise SystemExit(3)").returncode == 3
+    missing = escape("with-stand-ins", system, "--", "no-such-command")
     assert missing.returncode == 127
     assert "error: no-such-command: No such file or directory" in missing.stderr
 
@@ -54,7 +54,7 @@ def test_without_a_command_it_tells_the_environment_and_serves_until_stopped(
     environment, system: Path
 ) -> None:
     with subprocess.Popen(
-        [*ESCAPE, "rehearse", str(system), "--set", REGION, "--json"],
+        [*ESCAPE, "with-stand-ins", str(system), "--set", REGION, "--json"],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment,
     ) as server:  # fmt: skip
         assert server.stdout is not None
@@ -80,7 +80,7 @@ def test_without_a_command_it_tells_the_environment_and_serves_until_stopped(
         rest, said = server.communicate(timeout=60)
     assert done.stdout == "ALPAO mirror, SDK 3.04.05.0612 (stand-in) (208, 208)\n", done.stderr
     assert rest == "", "one document, told as soon as there is something to tell"
-    assert "rehearse: stopped" in said
+    assert "with-stand-ins: stopped" in said
     assert server.returncode == 0
     assert not Path(told["ESCAPE_STAND_IN_BENCH"]).parent.exists()
 
@@ -92,7 +92,7 @@ def test_ctrl_c_is_left_to_the_command(environment, system: Path) -> None:
         "except KeyboardInterrupt:\n    raise SystemExit(7)"
     )
     with subprocess.Popen(
-        [*ESCAPE, "rehearse", str(system), "--", sys.executable, "-c", waiting],
+        [*ESCAPE, "with-stand-ins", str(system), "--", sys.executable, "-c", waiting],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment, start_new_session=True,
     ) as running:  # fmt: skip
         assert running.stdout is not None

@@ -18,7 +18,8 @@ LINKED = ("--set", "devices.dm.mode=hardware", "--set", "devices.dm.options.repl
 @pytest.fixture
 def asm():
     """An emulated mirror and the options that lead to it."""
-    made = make_emulator(EmulatorRequest(port=0, options={"transition_speed": "1000", "hold_s": "20", "rest_s": "60"}))
+    options = {"transition_speed": "1000", "hold_s": "20", "rest_s": "60"}
+    made = make_emulator(EmulatorRequest(port=0, options=options))
     with made:
         port = made.start().rpartition(":")[2]
         yield made, ("maps-nir", *LINKED, "--set", f"devices.dm.options.port={port}")
@@ -43,13 +44,13 @@ def test_dm_verbs_have_their_documents(document):
 @pytest.mark.parametrize(
     ("words", "code", "message"),
     [
-        (("poke", "razor-shwfs", 97, 0.1), 2, "numbered 0 to 96"),
-        (("poke", "razor-shwfs", 0, 0.9), 2, "max_stroke is 0.8"),
+        (("poke", "razor-shwfs", 97, 0.1), 2, "the mirror has 0 to 96"),
+        (("poke", "razor-shwfs", 0, 0.9), 2, "exceeds devices.dm.limits.max_stroke, 0.8"),
         (("poke", "razor-shwfs", 0, "nan"), 2, "max_stroke"),
         (("poke", "razor-shwfs", 0, 0.1, "--second", 1), 2, "--second"),
-        (("poke", "maps-nir", 248, 0.01), 2, "out of service"),
+        (("poke", "maps-nir", 248, 0.01), 2, "disabled"),
         (("poke", "maps-nir", 0, 0.5, "--seconds", 0), 3, "beyond its limits, which allow 0.2"),
-        (("wave", "razor-shwfs", "--amplitude", 0.9), 3, "0.8 would not"),
+        (("wave", "razor-shwfs", "--amplitude", 0.9), 3, "0.8 does not"),
     ],
 )
 def test_what_cannot_be_is_refused_before_it_moves(escape, words, code, message):
@@ -97,7 +98,7 @@ def test_asm_verbs_lead_the_mirror_and_tell(document, asm):
     assert str(made.controller.shell.state) == "rested"
 
 
-def test_a_fault_is_cleared_only_by_who_says_that_it_was_seen_to(document, escape, asm, monkeypatch):
+def test_a_fault_is_cleared_only_after_a_confirmation(document, escape, asm, monkeypatch):
     made, options = asm
     monkeypatch.setattr(sys.stdin, "isatty", lambda: False, raising=False)
     made.inject("trip")
@@ -106,7 +107,7 @@ def test_a_fault_is_cleared_only_by_who_says_that_it_was_seen_to(document, escap
     assert "fault latched" in found["error"]["message"]
     code, _, err = escape("asm", "clear", *options)
     assert code == 2
-    assert "say so with --yes" in err
+    assert "confirm with --yes" in err
     assert str(made.controller.shell.state) == "fault"
     code, found, _ = document("asm", "clear", *options, "--yes")
     assert (code, found["before"], found["after"]) == (0, "fault", "rested")

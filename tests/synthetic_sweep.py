@@ -1,11 +1,11 @@
-"""A sweep whose loops are made up, so that what must be concluded from them is known."""
+"""A sweep of synthetic loops with known differences."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from escape_hw.runtime.sweep.design import EXPLORE, FINAL, Design, MatrixVariant, Slot
-from escape_hw.runtime.sweep.run import Sweep, SweepRun
+from escape_hw.runtime.sweep.design import EXPLORE, FINAL, Design, MatrixVariant, Slot, Sweep
+from escape_hw.runtime.sweep.run import SweepRun
 from escape_hw.runtime.sweep.search_space import parse_parameter
 from escape_hw.runtime.sweep.study import LoopRecord
 
@@ -19,17 +19,17 @@ SWEPT = Sweep(
 )
 
 
-def made_up(difference: float) -> SweepRun:
-    """Loops whose Strehl ratio is known: a hill in the gain, air in common, and a difference."""
+def synthetic_run(difference: float) -> SweepRun:
+    """Loops with a maximum in the gain, common turbulence, and a difference between the variants."""
     rng, records = np.random.default_rng(1), []
     for stage, count in ((EXPLORE, 40), (FINAL, 24)):
         for index in range(count):
-            air = rng.normal(0, 0.03)
+            turbulence = rng.normal(0, 0.03)
             gain = float(rng.uniform(0.1, 1.0)) if stage == EXPLORE else 0.5
-            for arm, offset in (("push-pull", 0.0), ("ESCAPE", difference)):
-                merit = 0.5 + air - (gain - 0.5) ** 2 + offset + rng.normal(0, 0.004)
+            for variant, offset in (("push-pull", 0.0), ("ESCAPE", difference)):
+                merit = 0.5 + turbulence - (gain - 0.5) ** 2 + offset + rng.normal(0, 0.004)
                 ways = {way: {"value": merit, "sigma": 0.01} for way in ("peak", "otf", "encircled")}
                 outcome = {"strehl": ways, "stable": True, "diverged": False}
                 values = {"gain": gain, "leak": 0.01, "dropped_modes": 3}
-                records.append(LoopRecord(Slot(stage, arm, index), values, outcome, merit))
+                records.append(LoopRecord(Slot(stage, variant, index), values, outcome, merit))
     return SweepRun(records)

@@ -1,0 +1,62 @@
+"""Worker processes that die are replaced; those that die again and again are given up."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from escape_hw.errors import CalibrationError
+from escape_hw.runtime.sweep.workers import LocalWorkers
+
+
+@pytest.fixture
+def workers():
+    one = LocalWorkers(1)
+    yield one
+    one.close()
+
+
+def die_once(mark: str) -> str:
+    """End the process the first time; afterwards return."""
+    path = Path(mark)
+    if path.exists():
+        return "done"
+    path.touch()
+    os._exit(1)
+
+
+def test_a_call_whose_worker_dies_is_made_again(workers, tmp_path):
+    assert workers.run(die_once, str(tmp_path / "mark")) == "done"
+
+
+def test_errors_of_a_call_are_raised(workers):
+    with pytest.raises(ValueError, match="invalid literal"):
+        workers.run(int, "x")
+
+
+def test_workers_that_die_again_and_again_are_given_up(workers):
+    with pytest.raises(CalibrationError, match="die again and again"):
+        workers.run(os._exit, 1)
+
+
+def test_closing_ends_a_call_at_once(workers):
+    found = []
+
+    def wait() -> None:
+        try:
+            workers.run(time.sleep, 60)
+        except CalibrationError as error:
+            found.append(str(error))
+
+    thread = threading.Thread(target=wait)
+    thread.start()
+    time.sleep(2)
+    began = time.monotonic()
+    workers.close()
+    thread.join(10)
+    assert time.monotonic() - began < 5
+    assert found == ["the workers are closed"]

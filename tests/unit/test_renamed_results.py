@@ -1,0 +1,20 @@
+"""Attributes of results of version 0.1.0 work with a warning."""
+
+from __future__ import annotations
+
+import fake_results as fake
+import pytest
+
+
+def test_a_registration():
+    estimate = fake.registration()
+    with pytest.warns(DeprecationWarning, match=r"RegistrationEstimate.measured is called"):
+        assert estimate.measured() == estimate.parameters()
+    with pytest.warns(DeprecationWarning, match=r"RegistrationEstimate.departures is called"):
+        assert estimate.departures is estimate.actuator_corrections
+
+
+def test_optical_gains():
+    result = fake.gains_result()
+    with pytest.warns(DeprecationWarning, match=r"GainsResult.beside is called"):
+        assert result.beside is result.comparisons

@@ -1,0 +1,39 @@
+"""SPRINT limits the threads of the linear algebra while it computes, not while it is suspended."""
+
+from __future__ import annotations
+
+from contextlib import contextmanager
+
+import numpy as np
+import small_system
+
+from escape_hw.api.interaction_matrix import InteractionMatrix
+from escape_hw.api.registration import Registration
+from escape_hw.calibration.sprint import fit
+from escape_sim.models.shack_hartmann import make_model, nominal_grid
+
+
+def test_the_limit_does_not_hold_while_the_procedure_is_suspended(monkeypatch):
+    entered = 0
+
+    @contextmanager
+    def limit():
+        nonlocal entered
+        entered += 1
+        try:
+            yield
+        finally:
+            entered -= 1
+
+    config = small_system.configuration()
+    model = make_model(config, None)
+    data = model.zonal_matrix(Registration(3.0, -5.0, 0.4)).astype(np.float32)
+    sigma = np.full(data.shape, 0.1, np.float32)
+    valid = nominal_grid(config).valid
+    matrix = InteractionMatrix(data, sigma, np.eye(model.n_act), valid, "small", "push-pull", True)
+    monkeypatch.setattr(fit, "limit_to_one_thread", limit)
+    suspended = 0
+    for _ in fit.fit_registration(matrix, model):
+        assert entered == 0
+        suspended += 1
+    assert suspended > 1
