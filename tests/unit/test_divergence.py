@@ -34,7 +34,7 @@ def converging(frames: int, level: float = 50.0) -> np.ndarray:
 
 def test_factor_and_time_come_from_the_configuration():
     config = configuration(
-        "server.diverging_factor=3", "server.diverging_s=0.4", "server.saturated_share=0.5"
+        "server.diverging_factor=3", "server.diverging_s=0.4", "server.saturated_fraction=0.5"
     )
     limits = DivergenceLimits.from_config(config)
     assert (limits.residual_factor, limits.residual_s, limits.saturated_fraction) == (3, 0.4, 0.5)
