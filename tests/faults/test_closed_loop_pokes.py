@@ -166,7 +166,7 @@ def test_a_loop_that_diverges_is_opened_and_told(closed_loop, more, factor):
 
 
 def test_a_delay_beyond_the_lags_is_told(closed_loop):
-    with pytest.raises(CalibrationError, match=r"later than calibration\.lags = 3 frames can tell"):
+    with pytest.raises(CalibrationError, match=r"beyond calibration\.lags = 3 frames"):
         measure(closed_loop, "twin.latency_s=0.006", "loop.gain=0.1", "calibration.lags=3")
 
 
