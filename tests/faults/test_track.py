@@ -286,7 +286,11 @@ def test_the_command_leaves_table_matrix_and_report(start, tmp_path, capsys):
 def test_what_it_refuses(start):
     with small(QUIET) as bench:
         sent = bench.dm.sent_count
-        for wrong in ({"seconds": 0.0}, {"seconds": 5, "poke": 0.0}, {"seconds": 5, "forgetting_time_s": -1.0}):
+        for wrong in (
+            {"seconds": 0.0},
+            {"seconds": 5, "poke": 0.0},
+            {"seconds": 5, "forgetting_time_s": -1.0},
+        ):
             with pytest.raises(ConfigError, match="at least"):
                 bench.run(track(bench, start.matrix, start.grid, **wrong))
         empty = np.zeros_like(start.matrix.data)

@@ -31,8 +31,8 @@ def test_a_product_stands_for_its_calibration(tmp_path: Path) -> None:
     [
         ("first/im.fits", r"not a str; read it: escape_hw.load_matrix\('first/im.fits'\)"),
         (Path("im.fits"), r"escape_hw.load_matrix\('im.fits'\)"),
-        (fake.matrix(), "an* InteractionMatrix; a matrix alone does not tell its geometry"),
-        (GainsRun(fake.gains_result(), fake.calibration()), "not a GainsRun; take its .rescaled"),
+        (fake.matrix(), "InteractionMatrix; a matrix alone has no sensor geometry"),
+        (GainsRun(fake.gains_result(), fake.calibration()), "not a GainsRun; take its .rescaled_calibration"),
         (SimpleNamespace(latest=None), "take its .latest"),
         (None, "not a NoneType"),
     ],

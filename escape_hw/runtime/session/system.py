@@ -42,7 +42,7 @@ CalibrationLike: TypeAlias = Union[CalibrationResult, "MatrixProduct"]
 
 _EXPECTED = "a calibration as returned by calibrate() or escape_hw.load_matrix() is needed"
 #: Attributes of other results that hold a calibration.
-_CONTAINERS = ("rescaled", "latest")
+_CONTAINERS = ("rescaled_calibration", "latest")
 
 
 def as_calibration(value: object) -> CalibrationResult:
