@@ -79,6 +79,7 @@ def test_an_unfinished_sweep_is_resumed(runs):
     assert all(drawn["explore", "ESCAPE", number, "0"] == gain for (_, _, number, _), gain in drawn.items())
 
 
+@pytest.mark.filterwarnings("ignore::escape_hw.deprecation.RenamedWarning")
 def test_a_loop_has_the_strehl_ratio_that_version_0_1_0_measured(runs):
     sweep, row = read_description(runs / "sweep").sweep, loops(runs / "sweep")["explore", "ESCAPE", "1", "0"]
     values = {one.key: type(one.at(0.0))(row[one.key]) for one in sweep.space}
