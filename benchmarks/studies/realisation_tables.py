@@ -1,4 +1,4 @@
-"""Errors of campaigns over random realisations: kept line by line, told as the rows of a Markdown table."""
+"""Errors of campaigns over random realisations: saved line by line, printed as the rows of a Markdown table."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-#: What a campaign keeps of a realisation: JSON numbers and nested lists, with null for what was refused.
+#: Values saved for a realisation: JSON numbers and nested lists, with null for what was refused.
 Line = dict[str, Any]
 
 
@@ -76,7 +76,7 @@ def row(
     Parameters
     ----------
     errors, sigmas
-        ``(n_plants, 5)``.
+        ``(n_realisations, 5)``.
     bound
         Rms Cramer-Rao bound ``(5,)``.
     """

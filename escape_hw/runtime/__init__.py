@@ -1,6 +1,4 @@
-"""The ``System`` class of scripts.
-
-The procedures shared by command line and server, sweeps, and device tools.
+"""What scripts, command line and server run: sessions, procedures, sweeps, device tools, displays.
 
 Numerics are in ``escape_hw.calibration``.
 """

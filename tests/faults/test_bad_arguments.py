@@ -152,7 +152,7 @@ def test_a_procedure_that_computes_nan_ends_flat(bench, good, monkeypatch):
         def __call__(self, slopes: np.ndarray) -> np.ndarray:
             return np.full(good.matrix.n_modes, np.nan if next(calls) > 40 else 1e-3)
 
-    monkeypatch.setattr("escape_hw.calibration.loop.performance.LeakyIntegrator", Broken)
+    monkeypatch.setattr("escape_hw.calibration.loop.control.LeakyIntegrator", Broken)
     with pytest.raises(CommandRejected, match="is nan"):
         bench.run(close_loop(bench, good.matrix, good.grid, frames=200))
     assert bench.dm.sent_count > 40

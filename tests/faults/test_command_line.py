@@ -180,7 +180,7 @@ def test_truncated_and_flipped_products(run, system, im, command, tmp_path):
 
 
 def test_a_dead_camera_and_a_lost_mirror_exit_3(run, system, im, tmp_path, monkeypatch):
-    monkeypatch.setattr(registry, "_OWN", {})
+    monkeypatch.setattr(registry, "_REGISTERED", {})
     opened = []
 
     def dying_camera(name, config, shared):

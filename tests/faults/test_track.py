@@ -202,7 +202,7 @@ def test_a_wrong_delay_is_told_and_the_measured_one_taken(start):
         found = followed(bench, start, 6, response=late)
     alarms = [alarm for alarm in found.alarms if alarm.kind == "delay"]
     assert len(alarms) == 1
-    assert f"not {late.delay:.2f}" in alarms[0].text
+    assert f"instead of {late.delay:.2f}" in alarms[0].text
     assert found.latest.response.delay == pytest.approx(start.response.delay, abs=0.1)
     error = np.array([found.rows[name][-1] for name in PARAMETERS]) - truth
     assert (np.abs(error[:3]) < [3.0, 3.0, 0.15]).all()

@@ -207,7 +207,7 @@ def test_no_frame_is_a_time_out_and_no_writer_a_loss(ring, spin_s):
             camera.next_frame(0.05)
         show(ring, 1)
         assert camera.next_frame(0.05).index == 1
-        with pytest.raises(SettingRejected, match="the process that writes its frames"):
+        with pytest.raises(SettingRejected, match="the process that writes the frames"):
             camera.configure(CameraSettings(Region(0, 0, 6, 4), 1e-3, 50.0))
         ring.close()
         with pytest.raises(DeviceLost, match="has ended"):
@@ -263,5 +263,5 @@ def test_what_is_not_allowed_is_said_and_the_loop_runs_all_the_same(monkeypatch)
     monkeypatch.setattr(realtime.os, "sched_setaffinity", refuse)
     with realtime_thread(cpus=[0]) as notes:
         assert len(notes) >= 2
-        assert "processors cannot be chosen" in notes[0]
+        assert "processor affinity refused" in notes[0]
         assert "no real-time priority" in notes[1]

@@ -1,7 +1,4 @@
-"""Byte transports to a PI controller (TCP.
-
-Serial, USB, emulator) and the choice among them from the configuration.
-"""
+"""Byte transports to a PI controller (TCP, serial line, USB, emulator) and the choice among them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Temporal response of mirror and sensor (weight per frame of lag), by instrumental variables.
+"""Temporal response of mirror and sensor: weight per frame of lag, and from it the loop delay.
 
 With slopes ``y``, predictions ``x`` from a matrix and the commands, and predictions ``z`` from the matrix and
 the pokes, the weights of the lags solve ``sum_t z_l(t) (y(t) - sum_k w_k x_k(t)) = 0`` (Söderström & Stoica

@@ -1,5 +1,4 @@
-"""The FITS products, one module per kind (matrix.
+"""FITS products, one module per kind, and the checked file format that they share.
 
-Gains, loop, frames, telemetry, run state), and the checked file format that they share. What a product holds
-as a Python object is defined in api/.
+Kinds: matrix, gains, loop, frames, telemetry, run state. The Python objects are defined in ``escape_hw.api``.
 """

@@ -1,7 +1,4 @@
-"""Calibrations and loop telemetry in the AOT standard (Gomes et al.
-
-2024), written and read through ``aotpy``.
-"""
+"""Calibrations and loop telemetry in the AOT standard (Gomes et al. 2024), through ``aotpy``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a reproduced result must meet to count as reproduced."""
+"""Pass criteria of procedures and of the reproduced results of the paper."""
 
 from __future__ import annotations
 

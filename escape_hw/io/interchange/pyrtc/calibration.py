@@ -1,7 +1,4 @@
-"""Import of a calibration through pyRTC's configuration.
-
-And export of an interaction matrix with the settings that pyRTC needs.
-"""
+"""Import of a calibration of pyRTC, and export of an interaction matrix with its settings."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Sensor geometry of pyRTC (Shack-Hartmann windows.
-
-Pyramid pupil images) and its conversion from and to ours.
-"""
+"""Sensor geometry of pyRTC (lenslet windows, pupil images) and conversion from and to ESCAPE's."""
 
 from __future__ import annotations
 

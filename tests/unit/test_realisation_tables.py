@@ -19,7 +19,7 @@ def tables():
     return module
 
 
-def test_plants_that_the_file_has_are_not_measured_again(tables, tmp_path):
+def test_realisations_that_the_file_has_are_not_measured_again(tables, tmp_path):
     target, measured = tmp_path / "new" / "lines.jsonl", []
 
     def measure(number):
@@ -30,13 +30,13 @@ def test_plants_that_the_file_has_are_not_measured_again(tables, tmp_path):
     lines = tables.each_realisation(target, {"frames": (20, 50)}, [1, 3], measure)
     assert measured == [0, 1, 3]
     assert [line["error"] for line in lines] == [0.0, 0.5, 1.5]
-    assert [json.loads(line)["plant"] for line in target.read_text().splitlines()] == [0, 1, 3]
+    assert [json.loads(line)["realisation"] for line in target.read_text().splitlines()] == [0, 1, 3]
 
 
-def test_plants_that_were_asked_for_otherwise_are_not_told_with_these(tables, tmp_path):
+def test_realisations_that_were_asked_for_otherwise_are_not_told_with_these(tables, tmp_path):
     target = tmp_path / "lines.jsonl"
     tables.each_realisation(target, {"frames": 20}, [0], lambda number: {})
     before = target.read_bytes()
-    with pytest.raises(SystemExit, match=r"lines\.jsonl has plants that were asked for otherwise"):
+    with pytest.raises(SystemExit, match=r"lines\.jsonl has realisations that were asked for otherwise"):
         tables.each_realisation(target, {"frames": 50}, [1], lambda number: {})
     assert target.read_bytes() == before
