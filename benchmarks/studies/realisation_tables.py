@@ -1,4 +1,4 @@
-"""Errors of campaigns over random realisations: saved line by line, printed as the rows of a Markdown table."""
+"""Errors over random realisations: saved line by line, printed as the rows of a Markdown table."""
 
 from __future__ import annotations
 

@@ -14,8 +14,7 @@ from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.results import CalibrationResult, RegistrationEstimate
 from escape_hw.api.sensor import SensorGeometry
 from escape_hw.errors import IncompatibleProduct, ProductError
-from escape_hw.io.fits import extensions as fits_geometry
-from escape_hw.io.fits import extensions as fits_parts
+from escape_hw.io.fits import extensions
 from escape_hw.io.fits import file as fits_file
 from escape_hw.io.fits.file import Product
 from escape_hw.io.provenance import Provenance
@@ -87,8 +86,8 @@ def save_matrix(path: Path | str, result: CalibrationResult, origin: Provenance 
         *_pack_matrix(matrix, ""),
         fits_file.image_extension("M2C", matrix.m2c.astype(np.float64)),
         fits_file.image_extension("VALID", matrix.valid),
-        *fits_geometry.pack_grid(result.grid),
-        fits_parts.pack_metrics(
+        *extensions.pack_grid(result.grid),
+        extensions.pack_metrics(
             {"sky_seconds": float(result.sky_seconds), "notes": list(result.notes)}, "RUN"
         ),
         fits_file.text_extension("CONFIG", origin.config_text),
@@ -96,9 +95,9 @@ def save_matrix(path: Path | str, result: CalibrationResult, origin: Provenance 
     if result.measured is not None:
         hdus += _pack_matrix(result.measured, "MEAS_")
     if result.registration is not None:
-        hdus += fits_parts.pack_registration(result.registration)
+        hdus += extensions.pack_registration(result.registration)
     if result.response is not None:
-        hdus.append(fits_parts.pack_response(result.response))
+        hdus.append(extensions.pack_response(result.response))
     if result.mean_frame is not None:
         hdus.append(fits_file.image_extension("FRAME", result.mean_frame.astype(np.float32), "count"))
     fits_file.write(path, hdus)
@@ -165,7 +164,7 @@ def _pack_matrix(matrix: InteractionMatrix, prefix: str) -> list[Any]:
             f"{prefix}IM", matrix.data.astype(np.float32), matrix.slope_unit, METHOD=matrix.method
         ),
         fits_file.image_extension(f"{prefix}SIGMA", matrix.sigma.astype(np.float32), matrix.slope_unit),
-        fits_parts.pack_metrics(matrix.metrics, f"{prefix}METRICS"),
+        extensions.pack_metrics(matrix.metrics, f"{prefix}METRICS"),
     ]
 
 
@@ -181,22 +180,22 @@ def _unpack_matrix(
         system=str(header["SYSTEM"]),
         method=str(cards["METHOD"]),
         simulated=bool(header["SIMULATE"]),
-        metrics=fits_parts.unpack_metrics(path, hdus, f"{prefix}METRICS"),
+        metrics=extensions.unpack_metrics(path, hdus, f"{prefix}METRICS"),
         slope_unit=str(cards["BUNIT"]),
     )
 
 
 def _unpack(path: Path, hdus: astropy_fits.HDUList, header: dict[str, Any]) -> CalibrationResult:
-    run = fits_parts.unpack_metrics(path, hdus, "RUN")
+    run = extensions.unpack_metrics(path, hdus, "RUN")
     frame = fits_file.read_array(path, hdus, "FRAME", np.float32) if "FRAME" in hdus else None
     return CalibrationResult(
         matrix=_unpack_matrix(path, hdus, header, ""),
-        grid=fits_geometry.unpack_grid(path, hdus),
+        grid=extensions.unpack_grid(path, hdus),
         frames=int(header["FRAMES"]),
         lost_frames=int(header["LOST"]),
         sky_seconds=float(run["sky_seconds"]),
-        response=fits_parts.unpack_response(path, hdus),
-        registration=fits_parts.unpack_registration(path, hdus),
+        response=extensions.unpack_response(path, hdus),
+        registration=extensions.unpack_registration(path, hdus),
         measured=_unpack_matrix(path, hdus, header, "MEAS_") if "MEAS_IM" in hdus else None,
         partial=header["FINISH"] == "aborted",
         mean_frame=frame,
