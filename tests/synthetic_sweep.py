@@ -7,7 +7,7 @@ import numpy as np
 from escape_hw.runtime.sweep.design import EXPLORE, FINAL, Design, MatrixVariant, Slot, Sweep
 from escape_hw.runtime.sweep.run import SweepRun
 from escape_hw.runtime.sweep.search_space import parse_parameter
-from escape_hw.runtime.sweep.study import LoopRecord
+from escape_hw.runtime.sweep.study import TrialRecord
 
 SWEPT = Sweep(
     "",
@@ -31,5 +31,5 @@ def synthetic_run(difference: float) -> SweepRun:
                 ways = {way: {"value": merit, "sigma": 0.01} for way in ("peak", "otf", "encircled")}
                 outcome = {"strehl": ways, "stable": True, "diverged": False}
                 values = {"gain": gain, "leak": 0.01, "dropped_modes": 3}
-                records.append(LoopRecord(Slot(stage, variant, index), values, outcome, merit))
+                records.append(TrialRecord(Slot(stage, variant, index), values, outcome, merit))
     return SweepRun(records)

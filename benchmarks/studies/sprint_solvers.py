@@ -53,7 +53,7 @@ _BAD = 0.03
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Case:
+class SolverCase:
     """A measured matrix with what is known of it."""
 
     matrix: InteractionMatrix
@@ -62,17 +62,17 @@ class Case:
     injected: NDArray[np.float64]
 
 
-def measure(system: str, number: int, frames: int) -> Case:
+def measure(system: str, number: int, frames: int) -> SolverCase:
     """DO-CRIME on random realisation ``number``, all imperfections on."""
     injected = random_registration(number)
     config = simulated_config(system, registration_overrides(injected), seed=number + 1)
     with System.from_config(config) as bench:
         run = bench.run(docrime_run(bench, frames=frames))
         model = bench.model(run.result.grid)
-    return Case(run.result.matrix, run.solution.covariance, model, injected.to_array())
+    return SolverCase(run.result.matrix, run.solution.covariance, model, injected.to_array())
 
 
-def with_bad_subapertures(case: Case, rng: np.random.Generator) -> Case:
+def with_bad_subapertures(case: SolverCase, rng: np.random.Generator) -> SolverCase:
     """The same matrix with some sub-apertures that see another's light."""
     n = case.matrix.n_slopes // 2
     bad = rng.choice(n, max(1, round(_BAD * n)), replace=False)
@@ -83,7 +83,9 @@ def with_bad_subapertures(case: Case, rng: np.random.Generator) -> Case:
     return replace(case, matrix=replace(case.matrix, data=data))
 
 
-def solve_case(case: Case, options: dict[str, Any]) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+def solve_case(
+    case: SolverCase, options: dict[str, Any]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
     """Errors and stated errors ``(5,)`` each, and the seconds that it took."""
     began = time.perf_counter()
     found = sprint(case.matrix, case.model, covariance=case.covariance, **options)

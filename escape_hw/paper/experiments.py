@@ -10,7 +10,7 @@ from escape_hw.api.representation import short_repr
 from escape_hw.api.results import CalibrationResult
 from escape_hw.bench import Bench
 from escape_hw.errors import Aborted, CalibrationError
-from escape_hw.runtime.procedures.calibration import calibrate_with_method, model_psf
+from escape_hw.runtime.procedures.calibration import calibrate_with_method
 from escape_hw.runtime.procedures.calibration_comparison import (
     CalibrationComparison,
     close_loop_at_best_gain,
@@ -19,6 +19,7 @@ from escape_hw.runtime.procedures.calibration_comparison import (
     measured_calibration,
     with_and_without_optical_gains,
 )
+from escape_hw.runtime.procedures.model_psf import model_psf
 
 #: The paper's two runs: 20 seconds and 3 minutes at 500 Hz.
 SHORT_FRAMES, LONG_FRAMES = 10_000, 100_000

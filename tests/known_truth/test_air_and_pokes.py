@@ -13,7 +13,7 @@ from escape_hw.api.pyramid import PyramidPupils
 from escape_hw.api.registration import Registration
 from escape_hw.pipeline.slopes.pyramid import slopes_of_image
 from escape_sim.models.pyramid import PyramidModel, nominal_pupils
-from escape_sim.models.pyramid_turbulence import RandomPokes, estimate_strength, unit_screens
+from escape_sim.models.pyramid_turbulence import PokePhase, estimate_strength, unit_screens
 
 
 @pytest.fixture(scope="module")
@@ -26,7 +26,7 @@ def poked(pupils: PyramidPupils, rms: float, turbulence: float | None = 0.0) -> 
     return PyramidModel(configuration(), replace(pupils, pokes=rms), turbulence=turbulence)
 
 
-def random_pokes(model: PyramidModel) -> RandomPokes:
+def random_pokes(model: PyramidModel) -> PokePhase:
     assert model._pokes is not None
     return model._pokes
 
@@ -47,12 +47,12 @@ def test_pokes_have_the_structure_function_of_their_phases(pupils: PyramidPupils
 def test_pokes_are_shared_among_modes_as_far_as_their_actuators_go() -> None:
     modes = np.random.default_rng(0).standard_normal((4, 8, 8))
     lit = np.ones((8, 8), bool)
-    pokes = RandomPokes.from_rms(0.1, np.array([1.0, 1.0, 0.02, 1.0]), modes, lit)
+    pokes = PokePhase.from_rms(0.1, np.array([1.0, 1.0, 0.02, 1.0]), modes, lit)
     amplitude = np.sqrt(np.square(pokes.modes_rad / modes).mean(axis=(1, 2)))
     assert amplitude[2] == pytest.approx(0.02, rel=1e-6)
     assert amplitude[[0, 1, 3]] == pytest.approx(np.sqrt((0.01 - 0.0004) / 3), rel=1e-6)
     # Asked for more than the limits leave, as by hand: all of them grow alike.
-    more = RandomPokes.from_rms(2.0, np.array([1.0, 1.0, 0.02, 1.0]), modes, lit)
+    more = PokePhase.from_rms(2.0, np.array([1.0, 1.0, 0.02, 1.0]), modes, lit)
     assert np.square(more.modes_rad / modes).mean(axis=(1, 2)).sum() == pytest.approx(4.0)
 
 

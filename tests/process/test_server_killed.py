@@ -24,27 +24,27 @@ from escape_hw.streams.segments import segments
 from escape_hw.supervision import process_start
 from escape_sim.devices.twins import shared_bench
 from escape_sim.stand_ins import LIBRARIES, StandInUnavailable, build_library
-from escape_sim.stand_ins.bench_server import StandInBench
+from escape_sim.stand_ins.bench_server import StandInBenchServer
 
 #: On the increments of the real camera, and with a state kept often.
 OPTIONS = ("devices.wfs.region=[216,152,208,208]", "calibration.checkpoint_s=0.3")
 
 
 @pytest.fixture
-def bench() -> Iterator[tuple[StandInBench, Spy]]:
+def bench() -> Iterator[tuple[StandInBenchServer, Spy]]:
     """The simulated bench, in this process, that the server's real drivers reach."""
     try:
         for name in LIBRARIES:
             build_library(name)
     except StandInUnavailable as reason:
         pytest.skip(str(reason))
-    server = StandInBench(configuration(*OPTIONS))
+    server = StandInBenchServer(configuration(*OPTIONS))
     spy = Spy(shared_bench(server.config, server.shared))
     with server:
         yield server, spy
 
 
-def on_metal(system: Path, server: StandInBench, folder: Path) -> AbstractContextManager[Served]:
+def on_metal(system: Path, server: StandInBenchServer, folder: Path) -> AbstractContextManager[Served]:
     options = [word for option in OPTIONS for word in ("--set", option)]
     return serving(system, "--mode", "hardware", *options, folder=folder, more=server.environment)
 

@@ -17,7 +17,7 @@ from escape_hw.remote.client import Connection
 from escape_hw.remote.state import Finish, Phase
 from escape_sim.devices.twins import shared_bench
 from escape_sim.stand_ins import LIBRARIES, StandInUnavailable, bench_server, build_library
-from escape_sim.stand_ins.bench_server import StandInBench
+from escape_sim.stand_ins.bench_server import StandInBenchServer
 
 #: On the increments of the real camera.
 REGION = "devices.wfs.region=[216,152,208,208]"
@@ -30,14 +30,14 @@ LIMITS = {
 
 
 @pytest.fixture(scope="module")
-def mirror() -> Iterator[tuple[StandInBench, Spy]]:
+def mirror() -> Iterator[tuple[StandInBenchServer, Spy]]:
     """The simulated bench, in this process, and what its mirror really does."""
     try:
         for name in LIBRARIES:
             build_library(name)
     except StandInUnavailable as reason:
         pytest.skip(str(reason))
-    server = StandInBench(configuration(REGION))
+    server = StandInBenchServer(configuration(REGION))
     spy = Spy(shared_bench(server.config, server.shared))
     with server:
         yield server, spy
@@ -45,7 +45,7 @@ def mirror() -> Iterator[tuple[StandInBench, Spy]]:
 
 @pytest.fixture(scope="module")
 def held(
-    system: Path, mirror: tuple[StandInBench, Spy], tmp_path_factory: pytest.TempPathFactory
+    system: Path, mirror: tuple[StandInBenchServer, Spy], tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[tuple[Connection, Connection, str]]:
     """Who may write, who looks on, and the name of a matrix."""
     words = ["--set", REGION]

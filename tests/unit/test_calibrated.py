@@ -13,7 +13,7 @@ from small_system import SMALL
 import escape_hw
 from escape_hw.calibration.optical_gain.bootstrap import GainsRun
 from escape_hw.io.fits.matrix import load_matrix, save_matrix
-from escape_hw.runtime.session.system import as_calibration, as_matrix_and_grid
+from escape_hw.runtime.session.calibration_input import as_calibration, as_matrix_and_grid
 
 
 def test_a_product_stands_for_its_calibration(tmp_path: Path) -> None:

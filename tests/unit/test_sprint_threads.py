@@ -10,7 +10,8 @@ import small_system
 from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.registration import Registration
 from escape_hw.calibration.sprint import fit
-from escape_sim.models.shack_hartmann import make_model, nominal_grid
+from escape_sim.models.factory import make_fast_model
+from escape_sim.models.shack_hartmann import nominal_grid
 
 
 def test_the_limit_does_not_hold_while_the_procedure_is_suspended(monkeypatch):
@@ -26,7 +27,7 @@ def test_the_limit_does_not_hold_while_the_procedure_is_suspended(monkeypatch):
             entered -= 1
 
     config = small_system.configuration()
-    model = make_model(config, None)
+    model = make_fast_model(config, None)
     data = model.zonal_matrix(Registration(3.0, -5.0, 0.4)).astype(np.float32)
     sigma = np.full(data.shape, 0.1, np.float32)
     valid = nominal_grid(config).valid

@@ -16,7 +16,7 @@ from escape_hw.runtime.sweep.search_space import (
     default_space,
     parse_parameter,
 )
-from escape_hw.runtime.sweep.study import LoopRecord
+from escape_hw.runtime.sweep.study import TrialRecord
 from escape_hw.runtime.sweep.trials import TrialSpec
 
 VARIANTS = [MatrixVariant(name, False, __file__, "") for name in ("A", "B", "C")]
@@ -94,15 +94,15 @@ def test_a_lucky_loop_is_not_shortlisted_before_a_good_neighbourhood():
     records = []
     for number, gain in enumerate(np.linspace(0, 1, 200)):
         merit = 0.4 - (gain - 0.6) ** 2 + rng.normal(0, 0.02)
-        records.append(LoopRecord(Slot(EXPLORE, "A", number), {"gain": float(gain)}, {}, float(merit)))
-    lucky = LoopRecord(Slot(EXPLORE, "A", 999), {"gain": 0.02}, {}, 0.9)
+        records.append(TrialRecord(Slot(EXPLORE, "A", number), {"gain": float(gain)}, {}, float(merit)))
+    lucky = TrialRecord(Slot(EXPLORE, "A", 999), {"gain": 0.02}, {}, 0.9)
     found = shortlist([*records, lucky], space, "A", 4)
     assert all(abs(one["gain"] - 0.6) < 0.15 for one in found)
 
 
 def test_diverged_loops_are_never_shortlisted():
     space = (Range("gain", 0.0, 1.0),)
-    records = [LoopRecord(Slot(EXPLORE, "A", n), {"gain": n / 10}, {}, 0.0) for n in range(10)]
+    records = [TrialRecord(Slot(EXPLORE, "A", n), {"gain": n / 10}, {}, 0.0) for n in range(10)]
     assert shortlist(records, space, "A", 4) == []
 
 

@@ -19,7 +19,7 @@ from escape_hw.config.loader import load_system
 from escape_hw.errors import DeviceError, DeviceLost
 from escape_hw.runtime.session.system import System
 from escape_sim.stand_ins import bench_server
-from escape_sim.stand_ins.bench_server import RequestKind, StandInBench, stand_in_environment
+from escape_sim.stand_ins.bench_server import RequestKind, StandInBenchServer, stand_in_environment
 
 #: The region lies on the increments of the real camera; the screen of the real bench is moved by hand.
 JOINED = (
@@ -31,10 +31,10 @@ JOINED = (
 
 
 @pytest.fixture
-def server() -> Iterator[StandInBench]:
+def server() -> Iterator[StandInBenchServer]:
     for name in ("asdk", "m3api", "aravis"):
         stand_in(name).clear(record=False)
-    with StandInBench(load_system("razor-shwfs", overrides=JOINED)) as one, stand_in_environment(one):
+    with StandInBenchServer(load_system("razor-shwfs", overrides=JOINED)) as one, stand_in_environment(one):
         yield one
 
 

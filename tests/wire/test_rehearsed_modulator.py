@@ -9,7 +9,7 @@ from driver_bench import stand_in
 from escape_hw.config.loader import load_system
 from escape_hw.runtime.session.system import System
 from escape_sim.devices.twins import shared_bench
-from escape_sim.stand_ins.bench_server import StandInBench, stand_in_environment
+from escape_sim.stand_ins.bench_server import StandInBenchServer, stand_in_environment
 
 #: A small pyramid on increments of the real camera.
 SMALL = (
@@ -27,7 +27,7 @@ def test_the_modulators_driver_turns_the_twins_beam() -> None:
     for name in ("asdk", "m3api", "aravis"):
         stand_in(name).clear(record=False)
     config = load_system("razor-pywfs", overrides=SMALL)
-    with StandInBench(config) as server, stand_in_environment(server):
+    with StandInBenchServer(config) as server, stand_in_environment(server):
         circle = shared_bench(config, server.shared).beam_path
         with System.from_config(load_system("razor-pywfs", mode="hardware", overrides=SMALL)) as bench:
             assert bench.simulated

@@ -101,7 +101,7 @@ def _task(system: str, frames: int, folder: Path) -> tuple[str, str, str, str]:
     from escape_hw.calibration.push_pull.procedure import push_pull
     from escape_hw.io.fits.matrix import save_matrix
     from escape_hw.io.provenance import file_sha256
-    from escape_hw.runtime.procedures.calibration import model_psf
+    from escape_hw.runtime.procedures.model_psf import model_psf
     from escape_hw.runtime.session.record import without_turbulence
 
     config = load_system(system)

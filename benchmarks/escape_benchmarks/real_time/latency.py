@@ -46,7 +46,7 @@ FULL_SCALE_BITS = 16
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Case:
+class LatencyCase:
     """What both codes run.
 
     Parameters
@@ -106,7 +106,7 @@ class TimestampingMirror(DeformableMirror):
 
 
 @contextmanager
-def paced_camera(case: Case) -> Iterator[str]:
+def paced_camera(case: LatencyCase) -> Iterator[str]:
     """A process that writes the case's frames at its rate; yields the segment's name."""
     with tempfile.TemporaryDirectory(prefix="escape-perf-") as folder:
         file = Path(folder) / "frames.npy"
@@ -128,7 +128,7 @@ def paced_camera(case: Case) -> Iterator[str]:
                 process.wait(10)
 
 
-def run_loop(case: Case, seconds: float, *, streams: bool = False) -> LatencyResult:
+def run_loop(case: LatencyCase, seconds: float, *, streams: bool = False) -> LatencyResult:
     """Close the loop on the case's frames for a while; with ``streams`` all it does goes to rings, too."""
     rows, columns = case.frames.shape[1:]
     info = CameraInfo("paced camera", "0", (rows, columns), FULL_SCALE_BITS, True)
@@ -157,7 +157,7 @@ def run_loop(case: Case, seconds: float, *, streams: bool = False) -> LatencyRes
 
 
 @contextmanager
-def _callbacks(case: Case, arrived: array[int], streams: bool) -> Iterator[Callbacks]:
+def _callbacks(case: LatencyCase, arrived: array[int], streams: bool) -> Iterator[Callbacks]:
     """Taps that book when frames came and, if asked for, write frames, commands and residuals to rings."""
     if not streams:
         yield Callbacks(frame=lambda frame: arrived.append(frame.arrived_ns))
@@ -179,7 +179,7 @@ def _callbacks(case: Case, arrived: array[int], streams: bool) -> Iterator[Callb
         )
 
 
-def _grid(case: Case) -> SubApertureGrid:
+def _grid(case: LatencyCase) -> SubApertureGrid:
     """Whole pixels, every lenslet lit."""
     valid = np.ones((case.n_sub, case.n_sub), np.bool_)
     half = (case.pitch - 1) / 2
@@ -192,7 +192,7 @@ _WARM_UP_S = 2.0
 _STREAMS = ("wfs_raw", "wfs", "signal", "signal_2d", "wfc", "wfc_2d")
 
 
-def run_peer(case: Case, seconds: float) -> LatencyResult | None:
+def run_peer(case: LatencyCase, seconds: float) -> LatencyResult | None:
     """Latency by pyRTC's own measure, frame published to command published; ``None``: not installed."""
     latency, streams = import_pyrtc("latency"), import_pyrtc("streams")
     if latency is None or streams is None:
@@ -223,7 +223,7 @@ def run_peer(case: Case, seconds: float) -> LatencyResult | None:
     return LatencyResult(np.array([s.p50_seconds, s.p99_seconds]) * 1e6, rate, 0)
 
 
-def _components(case: Case, n: dict[str, str]) -> tuple[Any, ...]:
+def _components(case: LatencyCase, n: dict[str, str]) -> tuple[Any, ...]:
     """Corrector, slopes, loop and sensor, in the order in which they start."""
     slopes_process, loop, corrector = (
         import_pyrtc(name) for name in ("slopes_process", "loop", "wavefront_corrector")
@@ -254,7 +254,7 @@ def _components(case: Case, n: dict[str, str]) -> tuple[Any, ...]:
     return mirror, slopes, control, wfs
 
 
-def _replay(case: Case) -> type:
+def _replay(case: LatencyCase) -> type:
     """A sensor of the peer's kind that publishes the case's frames at its rate."""
     sensor = import_pyrtc("wavefront_sensor")
     if sensor is None:
@@ -293,7 +293,7 @@ def run() -> list[BenchmarkRow]:
     return rows + _streams(make_case(*CASES[0]))
 
 
-def _streams(case: Case) -> list[BenchmarkRow]:
+def _streams(case: LatencyCase) -> list[BenchmarkRow]:
     """What it costs a loop that all it does goes to shared memory."""
     without_streams, with_streams = (
         run_loop(case, STREAMS_SECONDS),
@@ -308,14 +308,14 @@ def _streams(case: Case) -> list[BenchmarkRow]:
     return rows
 
 
-def make_case(n_sub: int, pitch: int, n_act: int, rate_hz: float) -> Case:
+def make_case(n_sub: int, pitch: int, n_act: int, rate_hz: float) -> LatencyCase:
     """Frames of spots that move, and a reconstructor of noise that keeps the mirror within its limits."""
     frames = np.stack([spots(n_sub, pitch, seed) for seed in range(8)])
     noise = np.random.default_rng(0).normal(0, 1e-4, (n_act, 2 * n_sub**2))
-    return Case(n_sub, pitch, rate_hz, frames, noise.astype(np.float32))
+    return LatencyCase(n_sub, pitch, rate_hz, frames, noise.astype(np.float32))
 
 
-def _rows(case: Case, ours: LatencyResult, peer: LatencyResult | None) -> list[BenchmarkRow]:
+def _rows(case: LatencyCase, ours: LatencyResult, peer: LatencyResult | None) -> list[BenchmarkRow]:
     note = (
         f"{len(ours.latency_us)} frames at {ours.rate_hz:.0f} Hz, {ours.lost} lost; {'; '.join(ours.notes)}"
     )

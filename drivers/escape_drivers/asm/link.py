@@ -25,7 +25,7 @@ _MAX_SEQUENCE = 0xFFFFFFFF
 R = TypeVar("R", bound=m.Welcome | m.Ack | m.Done | m.Param | m.HealthReport)
 
 
-class RequestRefused(DeviceError):
+class MirrorRefusal(DeviceError):
     """The mirror refused a request, and nothing of it was done.
 
     Attributes
@@ -113,7 +113,7 @@ class AsmLink:
         client_name = f"{os.uname().nodename} pid {os.getpid()}"
         try:
             welcome = self.request(m.Hello(self._role, self._token, client_name), m.Welcome)
-        except RequestRefused as refusal:
+        except MirrorRefusal as refusal:
             self.disconnect(str(refusal.args[1]))
             raise
         self._token = welcome.token
@@ -198,7 +198,7 @@ class AsmLink:
             self.disconnect(f"no answer within {self._reply_s:g} s")
             raise self.connection_lost_error() from error
         if isinstance(found, m.Nak):
-            raise RequestRefused(self.name, found)
+            raise MirrorRefusal(self.name, found)
         if not isinstance(found, answer):
             self.disconnect(f"a {type(found).__name__} came where a {answer.__name__} was due")
             raise self.connection_lost_error()

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from escape_drivers.asm import messages as m
 from escape_drivers.asm.codec import AsmCodec
-from escape_drivers.asm.link import AsmLink, RequestRefused
+from escape_drivers.asm.link import AsmLink, MirrorRefusal
 from escape_drivers.asm.messages import Welcome
 from escape_drivers.asm.options import EMULATOR, OPTION_RANGES, AsmOptions
 from escape_drivers.common.options import parse_options, require_in_range, require_serial
@@ -387,7 +387,7 @@ class AsmMirror(AdaptiveSecondary):
         np.multiply(command, self._section.stroke_m, out=self._metres)
         try:
             ack = self._link.command(self._metres)
-        except RequestRefused as refusal:
+        except MirrorRefusal as refusal:
             raise self._device_error_for(refusal) from refusal
         self._record_ack(ack)
         if ack.result is m.Result.APPLIED:
@@ -410,7 +410,7 @@ class AsmMirror(AdaptiveSecondary):
             )
         return self._guard_when_open().last
 
-    def _device_error_for(self, refusal: RequestRefused) -> DeviceError:
+    def _device_error_for(self, refusal: MirrorRefusal) -> DeviceError:
         """The error for a refused command, in the words of every adaptive secondary."""
         nak = refusal.nak
         self._last_state = nak.state

@@ -3,16 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 if TYPE_CHECKING:
+    from rich.console import RenderableType
+
     from escape_hw.api.results import CalibrationResult, LoopResult
     from escape_hw.api.tracking import TrackResult
     from escape_hw.calibration.optical_gain.bootstrap import GainsRun
-    from escape_hw.cli.context import CommandContext
+
+
+class Terminal(Protocol):
+    """Where results are printed."""
+
+    def show(self, *items: RenderableType) -> None:
+        """Print results for people on standard output."""
+
 
 #: Prints a result; gets the result, whether it is simulated, and its document.
-Display = Callable[["CommandContext", Any, bool, dict[str, Any]], None]
+Display = Callable[["Terminal", Any, bool, dict[str, Any]], None]
 
 
 def display_function(name: str) -> Display:
@@ -20,7 +29,7 @@ def display_function(name: str) -> Display:
     return _DISPLAYS.get(name, show_document)
 
 
-def show_document(context: CommandContext, result: object, simulated: bool, document: dict[str, Any]) -> None:
+def show_document(context: Terminal, result: object, simulated: bool, document: dict[str, Any]) -> None:
     """Print criteria and products, for procedures without a table of their own."""
     from escape_hw.cli.formatting import format_criteria, format_products, status_line
 
@@ -29,7 +38,7 @@ def show_document(context: CommandContext, result: object, simulated: bool, docu
 
 
 def show_calibration(
-    context: CommandContext, result: CalibrationResult, simulated: bool, document: dict[str, Any]
+    context: Terminal, result: CalibrationResult, simulated: bool, document: dict[str, Any]
 ) -> None:
     """Print size, signal-to-noise ratio and registration of a calibration."""
     from escape_hw.api.registration import Registration
@@ -51,7 +60,7 @@ def show_calibration(
 
 
 def show_sprint(
-    context: CommandContext, result: CalibrationResult, simulated: bool, document: dict[str, Any]
+    context: Terminal, result: CalibrationResult, simulated: bool, document: dict[str, Any]
 ) -> None:
     """Print the registration."""
     from escape_hw.cli.formatting import format_criteria, format_products, rich_table, status_line
@@ -63,7 +72,7 @@ def show_sprint(
     context.show(*format_criteria(document["criteria"]), *format_products(document["products"]))
 
 
-def show_gains(context: CommandContext, run: GainsRun, simulated: bool, document: dict[str, Any]) -> None:
+def show_gains(context: Terminal, run: GainsRun, simulated: bool, document: dict[str, Any]) -> None:
     """Print the rounds of the optical gains."""
     from escape_hw.cli.formatting import format_criteria, format_products, rich_table, status_line
     from escape_hw.report.tables import rounds_table
@@ -75,7 +84,7 @@ def show_gains(context: CommandContext, run: GainsRun, simulated: bool, document
     )
 
 
-def show_loop(context: CommandContext, result: LoopResult, simulated: bool, document: dict[str, Any]) -> None:
+def show_loop(context: Terminal, result: LoopResult, simulated: bool, document: dict[str, Any]) -> None:
     """Print the performance of a closed loop."""
     from escape_hw.cli.formatting import format_products, rich_table, status_line
     from escape_hw.report.tables import METHOD_LABELS, strehl_table
@@ -85,9 +94,7 @@ def show_loop(context: CommandContext, result: LoopResult, simulated: bool, docu
     context.show(*result.notes, *format_products(document["products"]))
 
 
-def show_track(
-    context: CommandContext, result: TrackResult, simulated: bool, document: dict[str, Any]
-) -> None:
+def show_track(context: Terminal, result: TrackResult, simulated: bool, document: dict[str, Any]) -> None:
     """Print the last registration of a track, its exchanges and its alarms."""
     from escape_hw.api.registration import Registration
     from escape_hw.api.results import Estimate

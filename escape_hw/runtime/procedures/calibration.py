@@ -16,9 +16,6 @@ from escape_hw.runtime.procedures.matrix_input import load_fitting_matrix, requi
 from escape_hw.runtime.procedures.sprint import SprintParameters
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
     from escape_hw.api.procedure import Procedure
     from escape_hw.api.results import CalibrationResult
     from escape_hw.api.sensor import SensorGeometry
@@ -474,25 +471,3 @@ def calibrate_with_method(
     from escape_hw.calibration.docrime.open_loop import docrime
 
     return (yield from docrime(bench, grid=grid, whiten=whiten, **common))
-
-
-def model_psf(bench: Bench, *, frames: int = 20) -> Procedure[NDArray[np.float32]]:
-    """Measure the model PSF, the reference of Strehl ratios, with the phase screen out of the beam.
-
-    Parameters
-    ----------
-    bench
-        An open bench with a science camera.
-    frames
-        Science frames to average.
-
-    Raises
-    ------
-    CalibrationError
-        The system has no science camera.
-    """
-    from escape_hw.calibration.acquisition.model_psf import measure_model_psf
-    from escape_hw.runtime.session.record import without_turbulence
-
-    with without_turbulence(bench):
-        return (yield from measure_model_psf(bench, frames=frames))

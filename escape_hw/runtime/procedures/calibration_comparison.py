@@ -14,7 +14,8 @@ from escape_hw.api.procedure import Procedure
 from escape_hw.api.representation import short_repr
 from escape_hw.api.results import CalibrationResult, LoopResult
 from escape_hw.bench import Bench
-from escape_hw.runtime.procedures.calibration import calibrate_with_method, model_psf
+from escape_hw.runtime.procedures.calibration import calibrate_with_method
+from escape_hw.runtime.procedures.model_psf import model_psf
 
 #: Suffix of a matrix's label when the matrix is scaled by its optical gains.
 WITH_GAINS = " + OG"

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from escape_hw.errors import IncompatibleProduct
 from escape_hw.runtime.procedures.declaration import ProcedureSpec, parameter
+from escape_hw.runtime.procedures.model_psf import MODEL_PSF_FRAMES, model_psf
 
 if TYPE_CHECKING:
     import numpy as np
@@ -20,8 +21,6 @@ if TYPE_CHECKING:
     from escape_hw.io.fits.matrix import MatrixProduct
 
 ResultT = TypeVar("ResultT")
-#: Science frames that are averaged for a model PSF.
-MODEL_PSF_FRAMES = 20
 
 
 def load_fitting_matrix(im: Path, config: SystemConfig, simulated: bool = False) -> MatrixProduct:
@@ -91,8 +90,6 @@ class MatrixProcedure(ProcedureSpec[ResultT]):
 
     def take_model_psf(self, bench: Bench) -> Procedure[NDArray[np.float32] | None]:
         """Measure the model PSF; ``None`` without a science camera or if Strehl ratios are not wanted."""
-        from escape_hw.runtime.procedures.calibration import model_psf
-
         if not self.strehl or bench.science is None:
             return None
         return (yield from model_psf(bench))

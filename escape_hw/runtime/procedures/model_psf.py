@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from escape_hw.runtime.procedures.declaration import ProcedureSpec, SavedRun, parameter
-from escape_hw.runtime.procedures.matrix_input import MODEL_PSF_FRAMES
 
 if TYPE_CHECKING:
     import numpy as np
@@ -16,6 +15,31 @@ if TYPE_CHECKING:
     from escape_hw.bench import Bench
     from escape_hw.io.run_folder import RunFolder
     from escape_hw.runtime.session.record import BenchRecord
+
+#: Science frames that are averaged for a model PSF.
+MODEL_PSF_FRAMES = 20
+
+
+def model_psf(bench: Bench, *, frames: int = MODEL_PSF_FRAMES) -> Procedure[NDArray[np.float32]]:
+    """Measure the model PSF, the reference of Strehl ratios, with the phase screen out of the beam.
+
+    Parameters
+    ----------
+    bench
+        An open bench with a science camera.
+    frames
+        Science frames to average.
+
+    Raises
+    ------
+    CalibrationError
+        The system has no science camera.
+    """
+    from escape_hw.calibration.acquisition.model_psf import measure_model_psf
+    from escape_hw.runtime.session.record import without_turbulence
+
+    with without_turbulence(bench):
+        return (yield from measure_model_psf(bench, frames=frames))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,8 +62,6 @@ class ModelPsfProcedure(ProcedureSpec[ModelPsf]):
 
     def procedure(self, bench: Bench, folder: RunFolder | None) -> Procedure[ModelPsf]:
         """Average science frames, the phase screen out of the beam."""
-        from escape_hw.runtime.procedures.calibration import model_psf
-
         return ModelPsf((yield from model_psf(bench, frames=self.frames)))
 
     def save(self, folder: RunFolder, record: BenchRecord, result: ModelPsf, wall_seconds: float) -> SavedRun:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeAlias, TypeVar, Union
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +26,7 @@ from escape_hw.runtime.procedures.model_psf import ModelPsfProcedure
 from escape_hw.runtime.procedures.python_method import procedure_method
 from escape_hw.runtime.procedures.sensor import SensorProcedure
 from escape_hw.runtime.procedures.track import TrackProcedure
+from escape_hw.runtime.session.calibration_input import CalibrationLike, as_calibration, as_matrix_and_grid
 
 if TYPE_CHECKING:
     from escape_hw.calibration.acquisition.checkpoint import Checkpoint
@@ -33,61 +34,7 @@ if TYPE_CHECKING:
     from escape_hw.calibration.acquisition.stopping import Target
     from escape_hw.calibration.loop.gain_search import GainSearch
     from escape_hw.calibration.optical_gain.bootstrap import GainsRun
-    from escape_hw.io.fits.matrix import MatrixProduct
     from escape_hw.runtime.sweep.result import SweepResult
-
-
-#: What ``calibrate`` or ``load_matrix`` returns.
-CalibrationLike: TypeAlias = Union[CalibrationResult, "MatrixProduct"]
-
-_EXPECTED = "a calibration as returned by calibrate() or escape_hw.load_matrix() is needed"
-#: Attributes of other results that hold a calibration.
-_CONTAINERS = ("rescaled_calibration", "latest")
-
-
-def as_calibration(value: object) -> CalibrationResult:
-    """The calibration itself, or that of a loaded product.
-
-    Raises
-    ------
-    TypeError
-        The value is something else; the message names its type and the remedy.
-    """
-    if isinstance(value, CalibrationResult):
-        return value
-    result = getattr(value, "result", None)
-    if isinstance(result, CalibrationResult):
-        return result
-    raise TypeError(f"{_EXPECTED}, not a {type(value).__name__}{_suggestion(value)}")
-
-
-def as_matrix_and_grid(
-    value: InteractionMatrix | CalibrationLike, grid: SensorGeometry | None
-) -> tuple[InteractionMatrix, SensorGeometry]:
-    """A matrix and its sensor geometry; a given ``grid`` takes precedence over that of a calibration.
-
-    Raises
-    ------
-    TypeError
-        A matrix without a grid, or neither a matrix nor a calibration.
-    """
-    if not isinstance(value, InteractionMatrix):
-        found = as_calibration(value)
-        return found.matrix, found.grid if grid is None else grid
-    if grid is None:
-        raise TypeError(f"a matrix alone has no sensor geometry: give the grid as well, or {_EXPECTED}")
-    return value, grid
-
-
-def _suggestion(value: object) -> str:
-    if isinstance(value, str | os.PathLike):
-        return f"; read it: escape_hw.load_matrix({os.fspath(value)!r})"
-    if isinstance(value, InteractionMatrix):
-        return "; a matrix alone has no sensor geometry"
-    for name in _CONTAINERS:
-        if hasattr(value, name):
-            return f"; take its .{name}"
-    return ""
 
 
 ResultT = TypeVar("ResultT")
@@ -155,7 +102,7 @@ class System(Bench):
         CalibrationError
             The system has no science camera.
         """
-        from escape_hw.runtime.procedures.calibration import model_psf
+        from escape_hw.runtime.procedures.model_psf import model_psf
 
         return self.run(model_psf(self, frames=frames), progress=progress)
 
@@ -344,7 +291,15 @@ class System(Bench):
 
         asked = {"trials": trials, "frames": frames, "sampler": sampler, "margin": margin, "storage": storage}
         return run_matrix_sweep(
-            self, matrices, Path(folder), vary, asked, workers=workers, scheduler=scheduler, progress=progress
+            self,
+            self.run,
+            matrices,
+            Path(folder),
+            vary,
+            asked,
+            workers=workers,
+            scheduler=scheduler,
+            progress=progress,
         )
 
     @procedure_method(TrackProcedure)

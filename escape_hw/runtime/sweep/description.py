@@ -17,7 +17,7 @@ from escape_hw.errors import ConfigError, ProductError
 from escape_hw.io.documents import dumps
 from escape_hw.io.provenance import file_sha256
 from escape_hw.io.storage import write_atomic
-from escape_hw.runtime.procedures.calibration import model_psf
+from escape_hw.runtime.procedures.model_psf import model_psf
 from escape_hw.runtime.sweep.design import METRICS, Design, MatrixVariant, Sweep, current_keys
 from escape_hw.runtime.sweep.search_space import DELAY_KEY, Parameter, format_value, parse_parameter
 from escape_hw.runtime.sweep.study import SAMPLERS, STORAGE_TIMEOUT_S, SweepStudy, redact_password

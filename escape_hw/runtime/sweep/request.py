@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,8 +17,9 @@ from escape_hw.runtime.sweep.search_space import (
 )
 
 if TYPE_CHECKING:
+    from escape_hw.bench import Bench
     from escape_hw.config.system import SystemConfig
-    from escape_hw.runtime.session.system import CalibrationLike, System
+    from escape_hw.runtime.session.calibration_input import CalibrationLike
     from escape_hw.runtime.sweep.design import MatrixVariant
     from escape_hw.runtime.sweep.result import SweepResult
 
@@ -102,7 +103,8 @@ def require_loop_frames(config: SystemConfig, frames: int) -> None:
 
 
 def run_matrix_sweep(
-    bench: System,
+    bench: Bench,
+    run: Callable[..., Any],
     matrices: Mapping[str, CalibrationLike],
     folder: Path,
     vary: Sequence[str],
@@ -125,9 +127,7 @@ def run_matrix_sweep(
     folder = folder.absolute()
     options = dict(request)
     variants, design = _save_matrices(matrices, folder), Design(trials=options.pop("trials"))
-    description = bench.run(
-        describe_sweep(bench, folder, variants, space, design, **options), progress=progress
-    )
+    description = run(describe_sweep(bench, folder, variants, space, design, **options), progress=progress)
     if (folder / DESCRIPTION_FILE).is_file():
         known = read_description(folder)
         description = known if known.settings() == description.settings() else description
@@ -136,7 +136,7 @@ def run_matrix_sweep(
     pool = open_workers(workers, scheduler) if simulated else None
     try:
         procedure = run_sweep(description.open_study(), pool or bench)
-        found = bench.run(procedure, progress=progress)
+        found = run(procedure, progress=progress)
     finally:
         if pool is not None:
             pool.close()
@@ -150,7 +150,7 @@ def _save_matrices(matrices: Mapping[str, CalibrationLike], folder: Path) -> lis
     from escape_hw.io.fits.matrix import load_matrix, save_matrix
     from escape_hw.io.storage import make_folder
     from escape_hw.runtime.procedures.products import product_key
-    from escape_hw.runtime.session.system import as_calibration
+    from escape_hw.runtime.session.calibration_input import as_calibration
     from escape_hw.runtime.sweep.design import MatrixVariant
 
     make_folder(folder)

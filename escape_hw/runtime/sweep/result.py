@@ -17,7 +17,7 @@ from escape_hw.api.results import Estimate, StrehlEstimate
 from escape_hw.pipeline.statistics import MIN_PAIRS, PairedComparison, compare_pairs, describe_comparison
 from escape_hw.runtime.sweep.design import EXPLORE, FINAL, METRICS, MatrixVariant, Sweep
 from escape_hw.runtime.sweep.run import SweepRun
-from escape_hw.runtime.sweep.study import LoopRecord
+from escape_hw.runtime.sweep.study import TrialRecord
 
 #: Importance of a dummy parameter without effect: the share that noise gives to any parameter.
 CHANCE = "chance"
@@ -91,7 +91,7 @@ class SweepResult:
         """Whether the operator stopped it."""
         return self.run.partial
 
-    def stage(self, stage: str, variant: str | None = None) -> list[LoopRecord]:
+    def stage(self, stage: str, variant: str | None = None) -> list[TrialRecord]:
         """Finished loops of a stage, of one variant or all."""
         return [
             r for r in self.run.records
@@ -127,7 +127,7 @@ def analyse_sweep(sweep: Sweep, run: SweepRun, margin: float = DEFAULT_MARGIN) -
     )  # fmt: skip
 
 
-def _summarise_final(final: Sequence[LoopRecord]) -> BestLoops:
+def _summarise_final(final: Sequence[TrialRecord]) -> BestLoops:
     strehls = []
     for metric in METRICS:
         values = np.array([r.outcome["strehl"][metric]["value"] if r.merit > 0 else 0.0 for r in final])
@@ -150,7 +150,7 @@ def _pairs(variants: Sequence[MatrixVariant]) -> Iterable[tuple[str, str]]:
     yield from zip(alike[1:], alike, strict=False)
 
 
-def _comparisons(sweep: Sweep, records: Iterable[LoopRecord], margin: float) -> Iterable[VariantComparison]:
+def _comparisons(sweep: Sweep, records: Iterable[TrialRecord], margin: float) -> Iterable[VariantComparison]:
     """Comparisons of the variants on their common realisations."""
     merits: dict[str, dict[int, float]] = {one.label: {} for one in sweep.variants}
     for record in records:
@@ -164,7 +164,7 @@ def _comparisons(sweep: Sweep, records: Iterable[LoopRecord], margin: float) -> 
 
 
 def importances(
-    sweep: Sweep, records: Sequence[LoopRecord], *, closed_only: bool = False
+    sweep: Sweep, records: Sequence[TrialRecord], *, closed_only: bool = False
 ) -> dict[str, float]:
     """Share of each parameter in the variance of the Strehl ratio (fANOVA, Hutter et al. 2014, by Optuna).
 

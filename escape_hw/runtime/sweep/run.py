@@ -17,7 +17,7 @@ from escape_hw.bench import Bench
 from escape_hw.errors import Aborted, CalibrationError
 from escape_hw.runtime.sweep.design import EXPLORE, SHORTLIST, Slot, Sweep
 from escape_hw.runtime.sweep.search_space import Choices, Parameter
-from escape_hw.runtime.sweep.study import LoopRecord, SweepStudy
+from escape_hw.runtime.sweep.study import SweepStudy, TrialRecord
 from escape_hw.runtime.sweep.trials import TrialSpec, run_closed_loop, run_trial
 from escape_hw.runtime.sweep.workers import Workers
 
@@ -36,7 +36,7 @@ Candidates = Mapping[tuple[str, int], Mapping[str, Any]]
 class SweepRun:
     """Loops of a sweep, and the best parameters by variant; ``partial`` when the operator stopped it."""
 
-    records: list[LoopRecord] = field(default_factory=list)
+    records: list[TrialRecord] = field(default_factory=list)
     best: dict[str, dict[str, Any]] = field(default_factory=dict)
     partial: bool = False
     __repr__ = short_repr
@@ -67,7 +67,7 @@ def run_sweep(study: SweepStudy, runner: Workers | Bench) -> Procedure[SweepRun]
     variants, design, result = study.sweep.variants, study.sweep.design, SweepRun()
     report, n_before = Reporter("sweep", design.n_loops(len(variants)), "loop"), 0
 
-    def run_stage(plan: list[Slot], values: Candidates) -> Procedure[list[LoopRecord]]:
+    def run_stage(plan: list[Slot], values: Candidates) -> Procedure[list[TrialRecord]]:
         nonlocal n_before
         stage = _run_on_bench if isinstance(runner, Bench) else _run_in_parallel
         yield from stage(study, runner, plan, values, report, n_before)  # type: ignore[arg-type]
@@ -172,7 +172,7 @@ def _run_on_bench(
 
 
 # ---------------------------------------------------------------- selection between the stages
-def _candidates(sweep: Sweep, records: Sequence[LoopRecord]) -> dict[tuple[str, int], dict[str, Any]]:
+def _candidates(sweep: Sweep, records: Sequence[TrialRecord]) -> dict[tuple[str, int], dict[str, Any]]:
     """Parameters of the second stage by variant and candidate."""
     found = {}
     for variant in sweep.variants:
@@ -189,7 +189,7 @@ def _candidates(sweep: Sweep, records: Sequence[LoopRecord]) -> dict[tuple[str, 
 
 
 def shortlist(
-    records: Sequence[LoopRecord], space: Sequence[Parameter], variant: str, count: int
+    records: Sequence[TrialRecord], space: Sequence[Parameter], variant: str, count: int
 ) -> list[dict[str, Any]]:
     """The parameters of the most promising loops of a variant's first stage, best first.
 
@@ -236,9 +236,9 @@ def unit_coordinate(one: Parameter, value: Any) -> float:
     return float((value - one.low) / (one.high - one.low))
 
 
-def best_candidate(records: Sequence[LoopRecord], variant: str) -> dict[str, Any]:
+def best_candidate(records: Sequence[TrialRecord], variant: str) -> dict[str, Any]:
     """The candidate of a variant with the highest mean merit over its replicates."""
-    replicates_of: dict[int, list[LoopRecord]] = {}
+    replicates_of: dict[int, list[TrialRecord]] = {}
     for record in records:
         if record.slot.stage == SHORTLIST and record.slot.variant == variant:
             replicates_of.setdefault(record.slot.candidate, []).append(record)

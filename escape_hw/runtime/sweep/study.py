@@ -47,7 +47,7 @@ RunLoop = Callable[[Slot, dict[str, Any]], tuple[dict[str, Any], float | None]]
 
 
 @dataclass(frozen=True, slots=True)
-class LoopRecord:
+class TrialRecord:
     """A finished loop: slot, parameters, outcome, and the Strehl ratio that is maximised, 0 if it diverged.
 
     See :func:`~escape_hw.runtime.sweep.trials.loop_outcome`.
@@ -285,14 +285,14 @@ class SweepStudy:
 
     # ------------------------------------------------------------------ results
     @_retried
-    def records(self) -> list[LoopRecord]:
+    def records(self) -> list[TrialRecord]:
         """Every finished loop once, in the order of the design."""
-        found: dict[Slot, LoopRecord] = {}
+        found: dict[Slot, TrialRecord] = {}
         for trial in self._study.get_trials(deepcopy=False, states=_FINISHED):
             if "slot" in trial.user_attrs:
                 slot, values = _slot_of(trial), {one.key: trial.params[one.key] for one in self.sweep.space}
                 merit = trial.value if trial.state == TrialState.COMPLETE else None
-                found.setdefault(slot, LoopRecord(slot, values, trial.user_attrs["outcome"], merit or 0.0))
+                found.setdefault(slot, TrialRecord(slot, values, trial.user_attrs["outcome"], merit or 0.0))
         return sorted(found.values(), key=lambda r: (r.slot.stage, r.slot.index, r.slot.candidate))
 
     @_retried

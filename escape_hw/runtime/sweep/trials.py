@@ -22,7 +22,7 @@ from escape_hw.config.loader import load_text
 from escape_hw.config.system import SystemConfig
 from escape_hw.errors import CalibrationError, IncompatibleProduct
 from escape_hw.io.documents import strehl_document
-from escape_hw.runtime.procedures.calibration import model_psf
+from escape_hw.runtime.procedures.model_psf import model_psf
 from escape_hw.runtime.sweep.design import Slot, Sweep
 from escape_hw.runtime.sweep.search_space import DELAY_KEY, config_overrides
 

@@ -25,7 +25,7 @@ from escape_sim.mirror.mode_surfaces import (
 )
 from escape_sim.models.pyramid_response import slope_response
 from escape_sim.models.pyramid_turbulence import (
-    RandomPokes,
+    PokePhase,
     estimate_strength,
     sample_distances,
     turbulence_registration_scatter,
@@ -275,13 +275,13 @@ class PyramidModel:
             )
         return self._modes
 
-    def _measured_pokes(self, scale: float) -> RandomPokes:
+    def _measured_pokes(self, scale: float) -> PokePhase:
         """Pokes of the measured rms; ``scale`` converts full stroke of surface to radians of phase."""
         m2c = self._basis()
         surfaces, lit, _ = self.influence_functions()
         # Pokes are uniformly distributed, with an rms of 1 / sqrt(3) of their maximum.
         max_amplitude = self._config.calibration.poke_command / np.abs(m2c).max(axis=0) / np.sqrt(3)
-        return RandomPokes.from_rms(
+        return PokePhase.from_rms(
             self._pupils.pokes, max_amplitude, scale * np.tensordot(m2c.T, surfaces, 1), lit
         )
 

@@ -28,7 +28,7 @@ _SCREEN_PUPILS = 8
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class RandomPokes:
+class PokePhase:
     """Random pokes of many modes at once, new in every frame.
 
     Parameters
@@ -49,7 +49,7 @@ class RandomPokes:
         max_amplitude: NDArray[np.float64],
         modes_rad: NDArray[np.float64],
         lit: NDArray[np.bool_],
-    ) -> RandomPokes:
+    ) -> PokePhase:
         """Pokes of a given rms over all modes, of equal amplitude except for modes at their maximum.
 
         Parameters
@@ -115,7 +115,7 @@ def sample_distances(n: int, pixel_m: float) -> NDArray[np.float64]:
 
 
 def estimate_strength(
-    optics: PyramidOptics, pupils: PyramidPupils, outer_scale: float, pokes: RandomPokes | None = None
+    optics: PyramidOptics, pupils: PyramidPupils, outer_scale: float, pokes: PokePhase | None = None
 ) -> float:
     """Estimate the pupil diameters over r0 at the sensor's wavelength from the motion of the slopes.
 
@@ -168,7 +168,7 @@ def _strength_from_rms(optics: PyramidOptics, pupils: PyramidPupils, screens: ND
 
 
 def _strength_with_pokes(
-    optics: PyramidOptics, pupils: PyramidPupils, screens: NDArray[np.float64], pokes: RandomPokes
+    optics: PyramidOptics, pupils: PyramidPupils, screens: NDArray[np.float64], pokes: PokePhase
 ) -> float:
     """Strength from the slopes' rms and the persistent fraction of their variance, with pokes."""
     halves = np.split(pokes.phases(2 * len(screens)), 2)

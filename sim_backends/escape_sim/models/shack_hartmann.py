@@ -15,8 +15,7 @@ from numpy.typing import DTypeLike, NDArray
 from scipy.special import ndtri
 
 from escape_hw.api.registration import Registration
-from escape_hw.api.sensor import SensorGeometry, SubApertureGrid
-from escape_hw.api.synthetic_model import SyntheticModel
+from escape_hw.api.sensor import SubApertureGrid
 from escape_hw.config.sensor import ShackHartmannSection
 from escape_hw.pipeline.slopes.shack_hartmann import subaperture_windows
 from escape_sim.mirror.influence_functions import InfluenceFunctions, nominal_influence_functions
@@ -379,13 +378,6 @@ def _apply_to_factors(table, first_y, first_x, side, y, out):  # type: ignore[no
 _MOTION_UNCERTAINTY = 0.25
 #: Up to this many modes, forming their surfaces is faster than the slopes of all actuators.
 _MAX_DIRECT_MODES = 12
-
-
-def make_model(config: SystemConfig, grid: SensorGeometry | None) -> SyntheticModel:
-    """Entry point ``fast`` of installations made before :mod:`escape_sim.models.factory`."""
-    from escape_sim.models.factory import make_fast_model
-
-    return make_fast_model(config, grid)
 
 
 def nominal_grid(config: SystemConfig) -> SubApertureGrid:

@@ -69,7 +69,7 @@ class RequestKind(enum.IntEnum):
     STOP = 5
 
 
-class StandInBench:
+class StandInBenchServer:
     """The simulated bench of a system behind a local socket; usable as a context manager.
 
     Parameters
@@ -281,7 +281,7 @@ def _receive_exactly(connection: socket.socket, length: int) -> bytes | None:
 
 
 @contextmanager
-def stand_in_environment(server: StandInBench) -> Iterator[None]:
+def stand_in_environment(server: StandInBenchServer) -> Iterator[None]:
     """Set the environment variables of a bench in this process."""
     before = {key: os.environ.get(key) for key in server.environment}
     os.environ.update(server.environment)

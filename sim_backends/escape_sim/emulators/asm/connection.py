@@ -67,7 +67,7 @@ def parse_fault_script(script: str) -> dict[int, AsmFault]:
     return {number: AsmFault.from_text(text) for text, number in split_fault_script(script)}
 
 
-class RequestHandler(Protocol):
+class ClientRequests(Protocol):
     """Receives the requests and events of all connections."""
 
     def connection_made(self, connection: AsmConnection) -> None:
@@ -106,7 +106,7 @@ class AsmConnection(asyncio.Protocol):
         Time of the last valid frame, monotonic seconds.
     """
 
-    def __init__(self, handler: RequestHandler) -> None:
+    def __init__(self, handler: ClientRequests) -> None:
         self._handler = handler
         self._transport: asyncio.Transport | None = None
         self._received = bytearray()

@@ -14,7 +14,7 @@ from escape_sim.emulators.e727.gcs import (
     MAX_ARGUMENTS,
     ONE_BYTE,
     CommandFramer,
-    GcsError,
+    GcsCommandError,
     format_items,
     format_lines,
     parse_integer,
@@ -108,15 +108,15 @@ class E727Controller:
 
     def _execute(self, line: str | None) -> bytes:
         if line is None:
-            return self._refuse("a line that is too long", GcsError(3))
+            return self._refuse("a line that is too long", GcsCommandError(3))
         readable = ONE_BYTE.get(line, line)
         self.received_commands.append(readable)
         try:
             return self._dispatch(line)
-        except GcsError as error:
+        except GcsCommandError as error:
             return self._refuse(readable, error)
 
-    def _refuse(self, line: str, error: GcsError) -> bytes:
+    def _refuse(self, line: str, error: GcsCommandError) -> bytes:
         """Set the error number; a violation unless it is a stop, since a driver can foresee the others."""
         self.state.error = error.number
         if error.number != 10:
@@ -137,9 +137,9 @@ class E727Controller:
             self._check_error_was_read(line)
             self._unread_command = line
         if len(args) > MAX_ARGUMENTS:
-            raise GcsError(24)
+            raise GcsCommandError(24)
         if name not in self._handlers:
-            raise GcsError(2)
+            raise GcsCommandError(2)
         reply = self._handlers[name](args)
         return b"" if reply is None else reply.encode("cp1252")
 
@@ -172,29 +172,29 @@ class E727Controller:
     def _stages(self, args: Sequence[str]) -> str:
         names = {"1": "S-330.2SL", "2": "S-330.2SL", "3": "NOSTAGE"}
         if any(name not in names for name in args):
-            raise GcsError(15)
+            raise GcsCommandError(15)
         return format_items({name: names[name] for name in args or names})
 
     def _set_level(self, args: Sequence[str]) -> None:
         if not args:
-            raise GcsError(26)
+            raise GcsCommandError(26)
         level = parse_integer(args[0])
         if level not in (0, 1):
-            raise GcsError(17)
+            raise GcsCommandError(17)
         if level == 1 and args[1:] != ["advanced"]:
-            raise GcsError(56)
+            raise GcsCommandError(56)
         self.state.level = level
 
     def _set_parameter(self, args: Sequence[str]) -> None:
         if len(args) < 3:
-            raise GcsError(26)
+            raise GcsCommandError(26)
         if self.state.level < 1:
-            raise GcsError(60)
+            raise GcsCommandError(60)
         item, parameter, value = args[0], parse_integer(args[1]), parse_number(args[2])
         if (item, parameter) not in self.state.parameters:
-            raise GcsError(54)
+            raise GcsCommandError(54)
         if parameter >= 0x0E000000:
-            raise GcsError(64)
+            raise GcsCommandError(64)
         self.state.parameters[item, parameter] = value
 
     def _parameters(self, args: Sequence[str]) -> str:
@@ -202,7 +202,7 @@ class E727Controller:
             self.state.parameters
         )
         if any(key not in self.state.parameters for key in keys):
-            raise GcsError(54)
+            raise GcsCommandError(54)
         # The parameter's number is returned without leading zeros.
         return format_lines(
             [f"{item} 0x{key:X}={value_text(self.state.parameters[item, key])}" for item, key in keys]
@@ -210,7 +210,7 @@ class E727Controller:
 
     def _save(self, args: Sequence[str]) -> None:
         if list(args) != ["100"]:
-            raise GcsError(56)
+            raise GcsCommandError(56)
 
     def _step_response(self, args: Sequence[str]) -> None:
         """``STE`` and ``IMP``: recorded moves; only the step is simulated."""

@@ -34,7 +34,7 @@ ERRORS = {
 }  # fmt: skip
 
 
-class GcsError(Exception):
+class GcsCommandError(Exception):
     """A command is refused; ``number`` is returned by ``ERR?``."""
 
     def __init__(self, number: int) -> None:
@@ -77,9 +77,9 @@ def parse_number(text: str) -> float:
     try:
         value = float(text)
     except ValueError:
-        raise GcsError(25) from None
+        raise GcsCommandError(25) from None
     if not math.isfinite(value):
-        raise GcsError(25)
+        raise GcsCommandError(25)
     return value
 
 
@@ -90,16 +90,16 @@ def parse_integer(text: str) -> int:
     except ValueError:
         value = parse_number(text)
         if value != int(value):
-            raise GcsError(25) from None
+            raise GcsCommandError(25) from None
         return int(value)
 
 
 def group_arguments(args: Sequence[str], size: int) -> list[Sequence[str]]:
     """Split arguments into groups of ``size``, at least one; raises error 26 or 24 otherwise."""
     if not args:
-        raise GcsError(26)
+        raise GcsCommandError(26)
     if len(args) % size:
-        raise GcsError(24)
+        raise GcsCommandError(24)
     return [args[k : k + size] for k in range(0, len(args), size)]
 
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from escape_sim.emulators.e727.gcs import GcsError, group_arguments, parse_integer, parse_number
+from escape_sim.emulators.e727.gcs import GcsCommandError, group_arguments, parse_integer, parse_number
 from escape_sim.emulators.e727.stage import SERVO_S, Hold, Ramp, Wave
 from escape_sim.emulators.e727.state import PER_VOLT, VOLTS, ControllerState
 
@@ -43,7 +43,7 @@ class MotionCommands:
             state.require_idle(name)
             on = parse_integer(text)
             if on not in (0, 1):
-                raise GcsError(17)
+                raise GcsCommandError(17)
             axis = state.axes[name]
             if on and not axis.zeroed:
                 state.report_violation(f"SVO {name} 1 before auto-zero: the sensor has an unknown offset")
@@ -61,10 +61,10 @@ class MotionCommands:
         for name, value in pairs:
             state.axis(name)
             if state.axes[name].servo:
-                raise GcsError(79)
+                raise GcsCommandError(79)
             state.require_idle(name)
             if not VOLTS[0] <= value <= VOLTS[1]:
-                raise GcsError(66)
+                raise GcsCommandError(66)
         state.stage.advance()
         for name, value in pairs:
             state.axes[name].volts = value
@@ -87,10 +87,10 @@ class MotionCommands:
             state.axis(name)
             state.require_idle(name)
             if not state.axes[name].servo:
-                raise GcsError(5)
+                raise GcsCommandError(5)
             low, high = state.travel(name)
             if not low <= target <= high:
-                raise GcsError(7)
+                raise GcsCommandError(7)
         now = state.stage.advance()
         for name, target in pairs:
             begin = float(state.stage.axes[name].trajectory.at(np.array([now]))[0])
@@ -103,11 +103,11 @@ class MotionCommands:
         for name, text in _require_unique(group_arguments(args, 2)):
             state.axis(name)
             if text.casefold() != "nan" and not VOLTS[0] <= parse_number(text) <= VOLTS[1]:
-                raise GcsError(66)
+                raise GcsCommandError(66)
             state.require_idle(name)
             axis = state.axes[name]
             if axis.servo:
-                raise GcsError(79)
+                raise GcsCommandError(79)
             state.stage.advance()
             now, steps = state.stage.now, max(1, round(state.settings.auto_zero_s / SERVO_S))
             sweep = np.interp(np.arange(64), [0, 16, 48, 63], [0.0, 1.0, 0.0, 0.0]) * state.settings.travel
@@ -119,7 +119,7 @@ class MotionCommands:
         for name, text in _require_unique(group_arguments(args, 2)):
             self._state.axis(name)
             if not 0 < parse_number(text) <= 1e7:
-                raise GcsError(8)
+                raise GcsCommandError(8)
             self._state.axes[name].velocity = parse_number(text)
 
     def halt(self, args: Sequence[str]) -> None:
@@ -129,7 +129,7 @@ class MotionCommands:
         for name in state.axes_of(args):
             state.axes[name].zero_end_step = None
             state.stage.axes[name].trajectory = Hold(state.stage.axes[name].position)
-        raise GcsError(10)
+        raise GcsCommandError(10)
 
     def moving_mask(self) -> int:
         """``#5``: one bit for each axis that moves."""
@@ -159,5 +159,5 @@ def _require_unique(pairs: Sequence[Sequence[str]]) -> list[Sequence[str]]:
     """The groups; raises error 22 if an axis is named twice."""
     names = [pair[0] for pair in pairs]
     if len(set(names)) < len(names):
-        raise GcsError(22)
+        raise GcsCommandError(22)
     return list(pairs)

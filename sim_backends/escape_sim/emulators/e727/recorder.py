@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from escape_sim.emulators.e727.gcs import (
-    GcsError,
+    GcsCommandError,
     format_array,
     format_items,
     format_lines,
@@ -75,9 +75,9 @@ class DataRecorder:
         for text, axis, option in group_arguments(args, 3):
             table = self._table(text)
             if parse_integer(option) not in (NOTHING, TARGET, POSITION):
-                raise GcsError(59)
+                raise GcsCommandError(59)
             if parse_integer(option) != NOTHING and axis not in self._stage.axes:
-                raise GcsError(58)
+                raise GcsCommandError(58)
             self.sources[table] = (axis, parse_integer(option))
 
     def configuration(self, args: Sequence[str]) -> str:
@@ -91,16 +91,16 @@ class DataRecorder:
         """``RTR``: servo steps per point."""
         ((text,),) = group_arguments(args, 1)[:1]
         if len(args) != 1:
-            raise GcsError(24)
+            raise GcsCommandError(24)
         if not 1 <= parse_integer(text) <= 1_000_000:
-            raise GcsError(17)
+            raise GcsCommandError(17)
         self.rate = parse_integer(text)
 
     def set_trigger(self, args: Sequence[str]) -> None:
         """``DRT table source value``: only all tables (0) and the default source (0) are supported."""
         for text, option, _value in group_arguments(args, 3):
             if parse_integer(text) or parse_integer(option):
-                raise GcsError(59)
+                raise GcsCommandError(59)
 
     def lengths(self, args: Sequence[str]) -> str:
         """``DRL?``: number of points recorded."""
@@ -115,9 +115,9 @@ class DataRecorder:
         count = parse_integer(args[1]) if len(args) > 1 else self._length() - first + 1
         tables = [self._table(text) for text in args[2:]] or sorted(self._recorded)
         if first < 1 or count < 1 or not tables or any(table not in self._recorded for table in tables):
-            raise GcsError(17)
+            raise GcsCommandError(17)
         if first + count - 1 > self._length():
-            raise GcsError(17)
+            raise GcsCommandError(17)
         columns = {}
         for table in tables:
             axis, option = self.sources[table]
@@ -127,5 +127,5 @@ class DataRecorder:
 
     def _table(self, text: str) -> int:
         if parse_integer(text) not in self.sources:
-            raise GcsError(57)
+            raise GcsCommandError(57)
         return parse_integer(text)

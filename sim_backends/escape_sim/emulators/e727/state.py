@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from escape_sim.emulators.e727.gcs import GcsError, format_items
+from escape_sim.emulators.e727.gcs import GcsCommandError, format_items
 from escape_sim.emulators.e727.recorder import POINTS, TABLES, DataRecorder
 from escape_sim.emulators.e727.stage import SERVO_S, Axis, Hold, Ramp, Stage, Wave
 
@@ -90,7 +90,7 @@ class ControllerState:
     def axis(self, name: str) -> Axis:
         """A moving axis; raises error 15 for other names and for the third channel, which has no stage."""
         if name not in self.stage.axes:
-            raise GcsError(15)
+            raise GcsCommandError(15)
         return self.stage.axes[name]
 
     def axes_of(self, args: Sequence[str]) -> list[str]:
@@ -134,9 +134,9 @@ class ControllerState:
     def require_idle(self, name: str) -> None:
         """Raise an error while auto-zero (61) or a wave generator (73) moves the axis."""
         if self.is_zeroing(name):
-            raise GcsError(61)
+            raise GcsCommandError(61)
         if self.is_wave_driven(name):
-            raise GcsError(73)
+            raise GcsCommandError(73)
 
     def position(self, name: str) -> float:
         """Present reading of the axis' sensor in microradians."""

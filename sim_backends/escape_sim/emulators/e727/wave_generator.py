@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from escape_sim.emulators.e727.gcs import (
-    GcsError,
+    GcsCommandError,
     format_array,
     format_lines,
     group_arguments,
@@ -61,25 +61,25 @@ class WaveGenerators:
     def define(self, args: Sequence[str]) -> None:
         """``WAV table X|&|+ SIN_P|PNT ...``."""
         if len(args) < 4:
-            raise GcsError(26)
+            raise GcsCommandError(26)
         table, how, kind = self._table_number(args[0]), args[1].upper(), args[2].upper()
         self._require_unused(table)
         if kind not in ("SIN_P", "PNT"):
-            raise GcsError(402)
+            raise GcsCommandError(402)
         segment = _sine(args[3:]) if kind == "SIN_P" else _points(args[3:])
         if how == "X":
             combined = segment
         elif how in ("&", "+") and table not in self.tables:
-            raise GcsError(401)
+            raise GcsCommandError(401)
         elif how == "&":
             combined = np.concatenate([self.tables[table], segment])
         elif how == "+" and len(segment) == len(self.tables[table]):
             combined = self.tables[table] + segment
         else:
-            raise GcsError(403 if how == "+" else 17)
+            raise GcsCommandError(403 if how == "+" else 17)
         others = sum(len(data) for key, data in self.tables.items() if key != table)
         if others + len(combined) > POINTS:
-            raise GcsError(67)
+            raise GcsCommandError(67)
         self.tables[table] = combined
 
     def clear(self, args: Sequence[str]) -> None:
@@ -91,27 +91,27 @@ class WaveGenerators:
 
     def _require_unused(self, table: int) -> None:
         if any(g.table == table and self._state.is_wave_driven(a) for a, g in self.generators.items()):
-            raise GcsError(73)
+            raise GcsCommandError(73)
 
     def lengths(self, args: Sequence[str]) -> str:
         """``WAV? table 1``: number of points of each table."""
         groups = group_arguments(args, 2) if args else []
         if any(parse_integer(parameter) != 1 for _, parameter in groups):
-            raise GcsError(17)
+            raise GcsCommandError(17)
         numbers = [self._table_number(table) for table, _ in groups] or sorted(self.tables) or [1]
         return format_lines([f"{t} 1={len(self.tables.get(t, ())):.9e}" for t in numbers])
 
     def read(self, args: Sequence[str]) -> str:
         """``GWD? first points tables``."""
         if len(args) < 3:
-            raise GcsError(26)
+            raise GcsCommandError(26)
         first, count = parse_integer(args[0]), parse_integer(args[1])
         tables = [self._table_number(text) for text in args[2:]]
         if any(table not in self.tables for table in tables):
-            raise GcsError(401)
+            raise GcsCommandError(401)
         shortest = min(len(self.tables[table]) for table in tables)
         if first < 1 or count < 1 or first + count - 1 > shortest:
-            raise GcsError(17)
+            raise GcsCommandError(17)
         columns = {f"Wave Table {t}": self.tables[t][first - 1 : first - 1 + count] for t in tables}
         return format_array(columns, SERVO_S)
 
@@ -122,7 +122,7 @@ class WaveGenerators:
             self._require_not_running(name)
             table = parse_integer(text)
             if table and self._table_number(text) not in self.tables:
-                raise GcsError(401)
+                raise GcsCommandError(401)
             self.generators[name].table = table
 
     def set_cycles(self, args: Sequence[str]) -> None:
@@ -130,7 +130,7 @@ class WaveGenerators:
         for name, text in group_arguments(args, 2):
             self._require_not_running(name)
             if parse_integer(text) < 0:
-                raise GcsError(17)
+                raise GcsCommandError(17)
             self.generators[name].cycles = parse_integer(text)
 
     def set_offset(self, args: Sequence[str]) -> None:
@@ -144,7 +144,7 @@ class WaveGenerators:
         for name, text, interpolation in group_arguments(args, 3):
             rate, interpolate = parse_integer(text), parse_integer(interpolation)
             if not 1 <= rate <= 1_000_000 or interpolate not in (0, 1):
-                raise GcsError(17)
+                raise GcsCommandError(17)
             for axis in self.generators if name == "0" else [name]:
                 self._require_not_running(axis)
                 self.generators[axis].rate, self.generators[axis].interpolate = rate, bool(interpolate)
@@ -176,19 +176,19 @@ class WaveGenerators:
         state = self._state
         state.axis(name)
         if mode not in (1, 0x101):
-            raise GcsError(406)
+            raise GcsCommandError(406)
         state.require_idle(name)
         generator = self.generators[name]
         if not generator.table:
-            raise GcsError(75)
+            raise GcsCommandError(75)
         if generator.table not in self.tables:
-            raise GcsError(401)
+            raise GcsCommandError(401)
         if not state.axes[name].servo:
-            raise GcsError(5)
+            raise GcsCommandError(5)
         wave = self.tables[generator.table] + generator.offset
         low, high = state.travel(name)
         if wave.min() < low or wave.max() > high:
-            raise GcsError(405)
+            raise GcsCommandError(405)
         return wave
 
     def _check_start(self, name: str, wave: NDArray[np.float64], running: Sequence[str]) -> None:
@@ -225,7 +225,7 @@ class WaveGenerators:
     def clear_trigger(self, args: Sequence[str]) -> None:
         """``TWC``."""
         if args:
-            raise GcsError(24)
+            raise GcsCommandError(24)
         self.levels.clear()
 
     def set_trigger(self, args: Sequence[str]) -> None:
@@ -233,7 +233,7 @@ class WaveGenerators:
         for text, point, level in group_arguments(args, 3):
             line, number, value = parse_integer(text), parse_integer(point), parse_integer(level)
             if line not in _LINES or number < 1 or value not in (0, 1):
-                raise GcsError(17)
+                raise GcsCommandError(17)
             self.levels.setdefault(line, {})[number] = value
 
     def set_output(self, args: Sequence[str]) -> None:
@@ -241,9 +241,9 @@ class WaveGenerators:
         for text, parameter, value in group_arguments(args, 3):
             line, number = parse_integer(text), parse_integer(parameter)
             if line not in _LINES or number not in _OUTPUT_PARAMETERS:
-                raise GcsError(17)
+                raise GcsCommandError(17)
             if number == _MODE and parse_integer(value) not in _MODES:
-                raise GcsError(17)
+                raise GcsCommandError(17)
             self.outputs[line, number] = parse_number(value)
 
     def output(self, args: Sequence[str]) -> str:
@@ -254,7 +254,7 @@ class WaveGenerators:
             else sorted(self.outputs)
         )
         if any(pair not in self.outputs for pair in pairs) or not pairs:
-            raise GcsError(17)
+            raise GcsCommandError(17)
         return format_lines(
             [f"{line} {parameter}={self.outputs[line, parameter]:g}" for line, parameter in pairs]
         )
@@ -276,24 +276,24 @@ class WaveGenerators:
     def _require_not_running(self, name: str) -> None:
         self._state.axis(name)
         if self._state.is_wave_driven(name):
-            raise GcsError(73)
+            raise GcsCommandError(73)
 
     def _table_number(self, text: str) -> int:
         if not 1 <= parse_integer(text) <= TABLES:
-            raise GcsError(400)
+            raise GcsCommandError(400)
         return parse_integer(text)
 
 
 def _sine(args: Sequence[str]) -> NDArray[np.float64]:
     """``n A O L S C``: from offset to offset plus amplitude at the centre and back, starting at ``S``."""
     if len(args) != 6:
-        raise GcsError(404)
+        raise GcsCommandError(404)
     segment, length, start, centre = (parse_integer(args[k]) for k in (0, 3, 4, 5))
     amplitude, offset = parse_number(args[1]), parse_number(args[2])
     if segment < 1 or length < 2 or length > segment:
-        raise GcsError(403)
+        raise GcsCommandError(403)
     if not 0 <= start < segment or not 0 < centre < length:
-        raise GcsError(405)
+        raise GcsCommandError(405)
     along = (np.arange(segment) - start) % segment
     rising = np.where(along < centre, along / (2 * centre), 0.5 + (along - centre) / (2 * (length - centre)))
     curve = offset + amplitude / 2 * (1 - np.cos(2 * np.pi * np.minimum(rising, 1.0)))
@@ -304,7 +304,7 @@ def _points(args: Sequence[str]) -> NDArray[np.float64]:
     """``1 n v1 ... vn``."""
     first, count = parse_integer(args[0]), parse_integer(args[1]) if len(args) > 1 else 0
     if first != 1:
-        raise GcsError(405)
+        raise GcsCommandError(405)
     if count < 1 or len(args) - 2 != count:
-        raise GcsError(404)
+        raise GcsCommandError(404)
     return np.array([parse_number(text) for text in args[2:]])
