@@ -1,4 +1,4 @@
-"""Limits of mirror commands, and pairs of adjacent actuators."""
+"""Limits of mirror commands (applied in ``guard``), and pairs of adjacent actuators."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Slopes, commands and pokes aligned by camera frame index, and buffers that collect them."""
+"""Slopes, commands and pokes paired by camera frame index, and buffers that collect them.
+
+Gaps in the index remove pairs; ``docrime.estimator`` and ``sprint.telemetry_fit`` use the index the same way.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""The fail-safe process: flattens the mirror when the engine died without a clean exit."""
+"""The fail-safe process: flattens the mirror when the engine died without a clean exit.
+
+Started and restarted by ``server.frontend.engine_process``.
+"""
 
 from __future__ import annotations
 

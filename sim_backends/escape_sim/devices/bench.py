@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from escape_hw.deprecation import renamed_members
 from escape_hw.errors import ConfigError
 from escape_sim.atmosphere.layers import Atmosphere, Seeing
 from escape_sim.atmosphere.phase_plates import PhasePlates
@@ -37,6 +38,7 @@ _RUN_KEY = 0x52554E
 _MAX_LAG_S = 0.05
 
 
+@renamed_members(place="set_positions")
 class SimBench:
     """Optics, mirror and clock shared by the simulated devices of a system.
 
