@@ -43,7 +43,7 @@ def parameter_hint(parameter: ProcedureParameter) -> str:
         words.append(f"At most {high:g}{unit}.")
     elif unit:
         words.append(f"In{unit}.")
-    if parameter.default is None:
+    if parameter.default in (None, ""):
         words.append("May be left empty.")
     return " ".join(word for word in words if word)
 
@@ -56,16 +56,16 @@ def format_value(value: object) -> str:
 
 
 def parse_value(parameter: ProcedureParameter, text: str) -> float | int | str | None:
-    """What a field's text means.
+    """Value of a field's text; ``None`` if an optional field is empty.
 
     Raises
     ------
     ValueError
-        It is no number, not whole or out of range; says what would do.
+        The text is not a number, not an integer or out of range; gives the allowed values.
     """
     text = text.strip().replace("−", "-")
     if not text or text == NO_CHOICE:
-        if parameter.default is None:
+        if parameter.default in (None, ""):
             return None
         raise ValueError(f"{label(parameter)}: empty; {format_value(parameter.default)} is usual")
     if parameter.kind not in ("int", "float"):

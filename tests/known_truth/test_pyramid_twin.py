@@ -197,7 +197,7 @@ def test_product_of_an_unknown_kind_is_refused(
     monkeypatch.setattr(PyramidPupils, "kind", "curvature")
     path = save_matrix(tmp_path / "im.fits", measured)
     monkeypatch.undo()
-    with pytest.raises(ProductError, match="kind 'curvature'; this version knows shack-hartmann, pyramid"):
+    with pytest.raises(ProductError, match="kind 'curvature'; this version reads shack-hartmann, pyramid"):
         load_matrix(path)
 
 

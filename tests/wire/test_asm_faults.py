@@ -169,7 +169,9 @@ def test_a_rest_while_the_link_was_gone_is_not_undone() -> None:
         wait_for(lambda: made.controller.shell.state is ShellState.RESTED, "the watchdog rests the shell")
         wait_for(lambda: made.server.owner is not None and mirror._link.is_up, "the link is back")
         assert mirror.state is ShellState.RESTED
-        with pytest.raises(DeviceError, match=r"is rested and follows no commands.*go\(ShellState.RUNNING\)"):
+        with pytest.raises(
+            DeviceError, match=r"is rested and follows no commands.*go_to\(ShellState.RUNNING\)"
+        ):
             mirror.send(np.zeros(336))
         mirror.go_to(ShellState.RUNNING)
         mirror.send(np.zeros(336))

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from escape_drivers.pi import gcs as pi_gcs
 from escape_drivers.pi.gcs import GcsError, MalformedReply, ReplyReader
 from escape_sim.emulators.e727.controller import E727Controller
-from escape_sim.emulators.e727.gcs import MAX_LINE, CommandFramer, array, format_lines
+from escape_sim.emulators.e727.gcs import MAX_LINE, CommandFramer, format_array, format_lines
 from escape_sim.emulators.e727.state import ControllerSettings
 
 #: What a line of a reply may hold: anything but line ends, NUL and a blank at its end.
@@ -104,7 +104,7 @@ def test_what_is_no_finite_number_is_garbled(text):
 def test_arrays_survive_the_wire_and_nothing_less_than_whole_is_taken(rows, columns):
     data = np.round(np.random.default_rng(rows).normal(size=(rows, columns)) * 1e3, 6)
     reader = ReplyReader()
-    reader.feed(array({f"c{k}": data[:, k] for k in range(columns)}, 5e-5).encode())
+    reader.feed(format_array({f"c{k}": data[:, k] for k in range(columns)}, 5e-5).encode())
     reply = reader.next_reply()
     assert reply is not None
     assert pi_gcs.array(reply, columns, rows) == pytest.approx(data, abs=1e-6)
