@@ -20,7 +20,7 @@ from escape_hw.calibration.loop.performance import close_loop
 from escape_hw.calibration.push_pull.procedure import push_pull
 from escape_hw.errors import Aborted
 from escape_hw.paper.experiments import reproduce_shwfs, reproduce_table1
-from escape_hw.runtime.procedures.calibration import model_psf
+from escape_hw.runtime.procedures.model_psf import model_psf
 from escape_hw.runtime.session.record import without_turbulence
 
 
