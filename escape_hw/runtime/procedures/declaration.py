@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -209,7 +210,7 @@ class SavedRun:
 
 
 @dataclass_transform(kw_only_default=True, eq_default=False, field_specifiers=(parameter,))
-class ProcedureSpec(Generic[ResultT]):
+class ProcedureSpec(ABC, Generic[ResultT]):
     """Base class of the procedures. An instance is one request, with a value for every parameter.
 
     A derived class declares its parameters as annotated attributes with :func:`parameter`, sets ``name``,
@@ -325,6 +326,7 @@ class ProcedureSpec(Generic[ResultT]):
             A file is damaged, or belongs to another system.
         """
 
+    @abstractmethod
     def procedure(self, bench: Bench, folder: RunFolder | None) -> Procedure[ResultT]:
         """The generator that does the work.
 
@@ -340,8 +342,8 @@ class ProcedureSpec(Generic[ResultT]):
         IncompatibleProduct
             A simulated matrix on hardware.
         """
-        raise NotImplementedError
 
+    @abstractmethod
     def save(self, folder: RunFolder, record: BenchRecord, result: ResultT, wall_seconds: float) -> SavedRun:
         """Save a complete or partial result with its report.
 
@@ -350,7 +352,6 @@ class ProcedureSpec(Generic[ResultT]):
         StorageError
             A file cannot be written.
         """
-        raise NotImplementedError
 
     def finish(self) -> None:
         """Remove files that are only needed to resume an incomplete run."""
@@ -378,13 +379,13 @@ class ProcedureSpec(Generic[ResultT]):
 class ComputedProcedure(ProcedureSpec[ResultT]):
     """A procedure that computes from saved products; the command line opens no device for it."""
 
+    @abstractmethod
     def compute(self) -> Procedure[ResultT]:
         """The generator that does the work."""
-        raise NotImplementedError
 
+    @abstractmethod
     def save_computed(self, folder: RunFolder, result: ResultT, wall_seconds: float) -> SavedRun:
         """Save the result with its report."""
-        raise NotImplementedError
 
     def procedure(self, bench: Bench, folder: RunFolder | None) -> Procedure[ResultT]:
         """The generator that does the work; the bench is not used."""
