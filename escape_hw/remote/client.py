@@ -236,7 +236,7 @@ class Connection:
         self._registered = True
         with self._changed:
             self._state = State.model_validate(answer)
-        lines, _ = self._request(ask.GetLog, count=1000)
+        lines, _ = self._request("log", count=1000)
         with self._changed:
             known = {line.number for line in self._log}
             old = [LogLine.model_validate(line) for line in lines if line["number"] not in known]
@@ -285,23 +285,20 @@ class Connection:
         # A client that was suspended for long is no longer registered.
         return self._registration() if refused else {"verb": "heartbeat", "client": self.client}
 
-    def _ask(self, request: ask.Request, timeout_s: float = TIMEOUT_S) -> tuple[Any, bytes]:
+    def _request(self, verb: str, timeout_s: float = TIMEOUT_S, **fields: Any) -> tuple[Any, bytes]:
+        """Send a request; returns its answer and bytes (ConfigError: a field is out of range)."""
+        request = ask.build_request(verb, client=self.client, **fields)
         document = request.model_dump(mode="json")
         try:
             answer, data, serial = self._link.send_request(document, timeout_s)
         except ClientUnknown:
             self._register()
             answer, data, serial = self._link.send_request(document, timeout_s)
-        if isinstance(request, ask.STATE_CHANGING_REQUESTS):
+        if verb in ask.STATE_CHANGING_VERBS:
             # Events and replies use different sockets: wait for the state that shows the effect.
             with self._changed:
                 self._changed.wait_for(lambda: self._state.serial >= serial, _EVENT_S)
         return answer, data
-
-    def _request(
-        self, kind: type[ask.Request], timeout_s: float = TIMEOUT_S, **fields: Any
-    ) -> tuple[Any, bytes]:
-        return self._ask(ask.build_request(kind, client=self.client, **fields), timeout_s)
 
     def _event(self, topic: str, document: dict[str, Any]) -> None:
         with self._changed:
@@ -346,7 +343,7 @@ class Connection:
 
     def _latest_over_network(self, stream: str, after: int) -> Sample | None:
         try:
-            head, data = self._request(ask.GetLatestSample, stream=stream, after=after)
+            head, data = self._request("latest_sample", stream=stream, after=after)
         except ServerGone:
             return None
         if head is None:
@@ -361,7 +358,7 @@ class Connection:
         known = self._geometry
         if known is None or known[0] != key:
             try:
-                answer, _ = self._request(ask.GetGeometry)
+                answer, _ = self._request("geometry")
             except EscapeError:
                 return Geometry() if known is None else known[1]
             known = self._geometry = (key, Geometry.model_validate(answer))
@@ -375,7 +372,7 @@ class Connection:
     def procedures(self) -> Sequence[ProcedureEntry]:
         """The procedures with their parameters."""
         if self._procedures is None:
-            answer, _ = self._request(ask.GetProcedures, SLOW_TIMEOUT_S)
+            answer, _ = self._request("procedures", SLOW_TIMEOUT_S)
             self._procedures = tuple(ProcedureEntry.model_validate(entry) for entry in answer)
         return self._procedures
 
@@ -387,9 +384,7 @@ class Connection:
         ConfigError
             An argument is unknown or out of range.
         """
-        answer, _ = self._request(
-            ask.PlanProcedure, SLOW_TIMEOUT_S, procedure=procedure, arguments=arguments or {}
-        )
+        answer, _ = self._request("plan", SLOW_TIMEOUT_S, procedure=procedure, arguments=arguments or {})
         return ProcedurePlan.model_validate(answer)
 
     def check(self, procedure: str, arguments: Arguments | None = None) -> ProcedurePlan:
@@ -419,7 +414,7 @@ class Connection:
         LeaseHeld
             Another client has control.
         """
-        answer, _ = self._request(ask.AcquireLease, take_over=take_over)
+        answer, _ = self._request("acquire_lease", take_over=take_over)
         lease = Lease.model_validate(answer)
         self._set_lease(lease)
         return lease
@@ -427,7 +422,7 @@ class Connection:
     def release(self) -> None:
         """Release control; does nothing when the server is gone."""
         try:
-            self._request(ask.ReleaseLease, 1.0)
+            self._request("release_lease", 1.0)
         except ServerGone:
             return
         self._set_lease(None)
@@ -440,15 +435,15 @@ class Connection:
     # ------------------------------------------------------------ safety
     def open_loop(self) -> None:
         """Open the loop; returns when the mirror is flat. Needs no control."""
-        self._request(ask.OpenLoop, SLOW_TIMEOUT_S)
+        self._request("open_loop", SLOW_TIMEOUT_S)
 
     def flatten(self) -> None:
         """Abort all activity; returns when the mirror is flat. Needs no control."""
-        self._request(ask.Flatten, SLOW_TIMEOUT_S)
+        self._request("flatten", SLOW_TIMEOUT_S)
 
     def abort(self) -> None:
         """Abort the procedure and save its data; returns when the mirror is flat. Needs no control."""
-        self._request(ask.AbortProcedure, SLOW_TIMEOUT_S)
+        self._request("abort_procedure", SLOW_TIMEOUT_S)
 
     # ------------------------------------------------------------ control
     def start(self, procedure: str, **arguments: float | int | bool | str | None) -> RemoteRun:
@@ -473,10 +468,7 @@ class Connection:
         declared = next((each for each in PROCEDURES if each.name == procedure), None)
         if declared is not None:
             arguments = present_names(declared.parameters(), arguments)
-        request = ask.build_request(
-            ask.StartProcedure, client=self.client, procedure=procedure, arguments=arguments
-        )
-        number, _ = self._ask(request, SLOW_TIMEOUT_S)
+        number, _ = self._request("start_procedure", SLOW_TIMEOUT_S, procedure=procedure, arguments=arguments)
         return RemoteRun(self, int(number), procedure)
 
     @procedure_method(EscapeProcedure)
@@ -532,11 +524,11 @@ class Connection:
 
     def pause(self) -> None:
         """Pause the running procedure between two steps, mirror flat."""
-        self._request(ask.PauseProcedure)
+        self._request("pause_procedure")
 
     def resume(self) -> None:
         """Resume a paused procedure."""
-        self._request(ask.ResumeProcedure)
+        self._request("resume_procedure")
 
     def close_loop(
         self,
@@ -546,8 +538,9 @@ class Connection:
         dropped_modes: int | None = None,
     ) -> None:
         """Close the loop with a matrix of ``state.products`` until it is opened."""
-        settings = {"matrix": matrix, "gain": gain, "leak": leak, "dropped_modes": dropped_modes}
-        self._request(ask.CloseLoop, SLOW_TIMEOUT_S, **settings)
+        self._request(
+            "close_loop", SLOW_TIMEOUT_S, matrix=matrix, gain=gain, leak=leak, dropped_modes=dropped_modes
+        )
 
     def set_loop(
         self,
@@ -557,25 +550,26 @@ class Connection:
         dropped_modes: int | None = None,
     ) -> None:
         """Change parameters of the loop, closed or not; absent ones stay."""
-        settings = {"matrix": matrix, "gain": gain, "leak": leak, "dropped_modes": dropped_modes}
-        self._request(ask.SetLoop, SLOW_TIMEOUT_S, **settings)
+        self._request(
+            "set_loop", SLOW_TIMEOUT_S, matrix=matrix, gain=gain, leak=leak, dropped_modes=dropped_modes
+        )
 
     def load_product(self, path: str | Path, name: str | None = None) -> ProductEntry:
         """Load a FITS product into the server, by default under its file's name."""
-        answer, _ = self._request(ask.LoadProduct, SLOW_TIMEOUT_S, path=str(path), name=name)
+        answer, _ = self._request("load_product", SLOW_TIMEOUT_S, path=str(path), name=name)
         return ProductEntry.model_validate(answer)
 
     def record(self, on: bool) -> None:
         """Start or stop recording telemetry at full rate."""
-        self._request(ask.SetRecording, SLOW_TIMEOUT_S, on=on)
+        self._request("set_recording", SLOW_TIMEOUT_S, on=on)
 
     def clear_fault(self) -> None:
         """Release the latched fault; closed devices are opened again."""
-        self._request(ask.ClearFault, SLOW_TIMEOUT_S)
+        self._request("clear_fault", SLOW_TIMEOUT_S)
 
     def shutdown(self) -> None:
         """Make the mirror safe and end the server."""
-        self._request(ask.Shutdown)
+        self._request("shutdown")
 
 
 def connect(address: str, *, control: bool = False, take_over: bool = False, name: str = "") -> Connection:

@@ -25,6 +25,7 @@ from escape_hw.server.frontend.engine_process import EngineProcess
 from escape_hw.supervision import Backoff
 
 CLOSED = LoopParameters("im", 0.3, 0.01, 2)
+STORE: Any = SimpleNamespace(matrix_path=Path)
 
 
 def idle_state() -> EngineState:
@@ -46,6 +47,10 @@ class Owner:
         config = SimpleNamespace(system=SimpleNamespace(name="small"), to_toml=str)
         self.bench = SimpleNamespace(wfs=self, config=config, simulated=True)
         self.state = idle_state()
+        self.publisher = SimpleNamespace(reset_residual=lambda: None)
+        self.state_publisher = SimpleNamespace(publish=lambda: None)
+        self.sent: list[Any] = []
+        self.send = self.sent.append
         self.flat = 0
 
     def stop(self) -> None:
@@ -74,15 +79,9 @@ def owner(monkeypatch: pytest.MonkeyPatch) -> Owner:
     return owner
 
 
-def services(owner: Owner) -> tuple[Any, ...]:
-    """State, publishers and store, as the runners get them."""
-    publisher = SimpleNamespace(reset_residual=lambda: None)
-    return owner.state, publisher, SimpleNamespace(publish=lambda: None), SimpleNamespace(matrix_path=Path)
-
-
-def procedure_runner(owner: Any, runs: Path, sent: list[Any]) -> ProcedureRunner:
-    loop_runner = LoopRunner(owner, *services(owner))
-    return ProcedureRunner(owner, loop_runner, *services(owner), config_text="", runs=runs, send=sent.append)
+def procedure_runner(owner: Any, runs: Path) -> ProcedureRunner:
+    loop_runner = LoopRunner(owner, STORE)
+    return ProcedureRunner(owner, loop_runner, STORE, config_text="", runs=runs)
 
 
 def finished(run: int) -> FinishedRun:
@@ -92,7 +91,7 @@ def finished(run: int) -> FinishedRun:
 def test_a_loop_that_cannot_be_closed_is_reported_and_does_not_count_as_closed(owner: Any) -> None:
     reported: list[EscapeError | None] = []
     request = CloseLoop(client="0" * 8, matrix="im")
-    LoopRunner(owner, *services(owner)).close(request, reported.append)
+    LoopRunner(owner, STORE).close(request, reported.append)
     now = owner.state.snapshot
     assert [str(error) for error in reported] == ["wfs: the camera has gone"]
     assert now.fault is not None
@@ -101,15 +100,14 @@ def test_a_loop_that_cannot_be_closed_is_reported_and_does_not_count_as_closed(o
 
 def test_a_run_that_cannot_begin_ends(owner: Any, tmp_path: Path) -> None:
     task: Any = SimpleNamespace(kind="docrime", overrides=(), load=lambda config, simulated: None)
-    sent: list[Any] = []
-    assert procedure_runner(owner, tmp_path, sent).start(task, "docrime", {}, needs_loop=False) == 3
+    assert procedure_runner(owner, tmp_path).start(task, "docrime", {}, needs_loop=False) == 3
     now = owner.state.snapshot
     assert now.active_run is None
     assert now.last_run is not None
     assert (now.last_run.finish, now.last_run.message) == (Finish.FAILED, "wfs: the camera has gone")
     assert now.phase is Phase.FAULT
     assert owner.flat == 1
-    assert sent[-1]["ended"]["id"] == 3
+    assert owner.sent[-1]["ended"]["id"] == 3
 
 
 def test_a_closed_loop_is_opened_for_a_procedure_that_needs_one_and_closed_again() -> None:

@@ -19,9 +19,7 @@ from escape_hw.remote.requests import CloseLoop, SetLoop
 from escape_hw.runtime.procedures.matrix_input import load_fitting_matrix, require_hardware_matrix
 from escape_hw.server.engine.bench_owner import BenchOwner
 from escape_hw.server.engine.product_store import ProductStore
-from escape_hw.server.engine.publisher import StreamPublisher
-from escape_hw.server.engine.state import EngineState, LoopParameters
-from escape_hw.server.engine.state_publisher import StatePublisher
+from escape_hw.server.engine.state import LoopParameters
 
 log = logging.getLogger(__name__)
 
@@ -39,18 +37,10 @@ class LoopRunner:
         PSF without turbulence ``(rows, columns)``, once measured; the running Strehl ratio needs it.
     """
 
-    def __init__(
-        self,
-        owner: BenchOwner,
-        state: EngineState,
-        publisher: StreamPublisher,
-        state_publisher: StatePublisher,
-        product_store: ProductStore,
-    ) -> None:
-        self._owner, self._bench, self._state = owner, owner.bench, state
+    def __init__(self, owner: BenchOwner, product_store: ProductStore) -> None:
+        self._owner, self._bench, self._state = owner, owner.bench, owner.state
         #: A procedure replaces the bench's configuration while it runs.
         self._config = owner.bench.config
-        self._publisher, self._state_publisher = publisher, state_publisher
         self._product_store = product_store
         self.model_psf: NDArray[np.float32] | None = None
 
@@ -123,9 +113,9 @@ class LoopRunner:
         state = self._state
         try:
             self._bench.wfs.stop()
-            self._publisher.reset_residual()
+            self._owner.publisher.reset_residual()
             state.set_loop_closed(True)
-            self._state_publisher.publish()
+            self._owner.state_publisher.publish()
             on_closed(None)
             log.info("loop closed on '%s', gain %g", settings.matrix, settings.gain)
             end = run_procedure(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +19,7 @@ from escape_hw.runtime.session.record import BenchRecord
 from escape_hw.server.engine.bench_owner import BenchOwner
 from escape_hw.server.engine.loop import LoopRunner
 from escape_hw.server.engine.product_store import ProductStore
-from escape_hw.server.engine.publisher import StreamPublisher
-from escape_hw.server.engine.state import EngineState, LoopParameters, RunTicket
-from escape_hw.server.engine.state_publisher import StatePublisher
+from escape_hw.server.engine.state import LoopParameters, RunTicket
 
 log = logging.getLogger(__name__)
 
@@ -39,19 +36,14 @@ class ProcedureRunner:
         self,
         owner: BenchOwner,
         loop_runner: LoopRunner,
-        state: EngineState,
-        publisher: StreamPublisher,
-        state_publisher: StatePublisher,
         product_store: ProductStore,
         *,
         config_text: str,
         runs: Path,
-        send: Callable[[Mapping[str, Any]], object],
     ) -> None:
-        self._owner, self._bench, self._loop_runner, self._state = owner, owner.bench, loop_runner, state
-        self._publisher, self._state_publisher = publisher, state_publisher
-        self._product_store = product_store
-        self._config_text, self._runs, self._send = config_text, runs, send
+        self._owner, self._bench, self._state = owner, owner.bench, owner.state
+        self._loop_runner, self._product_store = loop_runner, product_store
+        self._config_text, self._runs = config_text, runs
 
     def start(self, task: ProcedureSpec[Any], name: str, arguments: Arguments, needs_loop: bool) -> int:
         """Load a task, reserve the engine and queue the procedure; returns the number of its run."""
@@ -69,7 +61,7 @@ class ProcedureRunner:
         words = ", ".join(f"{key} {value}" for key, value in run.arguments.items() if value is not None)
         log.info("run %d: %s %s", run.id, run.name, words)
         previous_config, bench.config = bench.config, config
-        self._publisher.reset_residual()
+        self._owner.publisher.reset_residual()
         self._state.set_loop_closed(self._state.snapshot.needs_loop)
         try:
             finished = self._run_in_folder(ticket, task)
@@ -82,8 +74,8 @@ class ProcedureRunner:
         self._store_products(finished)
         self._finish(finished, ticket.loop_before)
         # The state that clients receive before the end of the run lists its products.
-        self._state_publisher.publish()
-        self._send({"ended": finished.model_dump(mode="json")})
+        self._owner.state_publisher.publish()
+        self._owner.send({"ended": finished.model_dump(mode="json")})
         self._owner.send_flat_replies()
 
     def _run_in_folder(self, ticket: RunTicket, task: ProcedureSpec[Any]) -> FinishedRun:
@@ -94,7 +86,7 @@ class ProcedureRunner:
             kind = f"{task.kind}-{run.id}"
             with RunFolder(system, task.kind, dated_folder(self._runs, system, kind)) as folder:
                 folder.write_config(self._bench.config.to_toml())
-                self._send({"run": {"id": run.id, "name": run.name, "folder": str(folder.path)}})
+                self._owner.send({"run": {"id": run.id, "name": run.name, "folder": str(folder.path)}})
                 saved, stop = self._run_and_save(ticket, task, folder)
         except Exception as error:
             self._owner.flatten()
@@ -140,10 +132,10 @@ class ProcedureRunner:
         self._state.set_loop_closed(False)
         grid, psf = getattr(result, "grid", None), getattr(result, "model_psf", None)
         if grid is not None:
-            self._publisher.set_geometry(grid)
+            self._owner.publisher.set_geometry(grid)
         if psf is not None:
             self._loop_runner.model_psf = psf
-            self._publisher.publish_arrays({"model_psf": psf})
+            self._owner.publisher.publish_arrays({"model_psf": psf})
         saved = task.save(folder, record, result, time.monotonic() - began)
         if stop is None:
             task.finish()
