@@ -25,7 +25,7 @@ from escape_gui.main_window import MainWindow
 from escape_gui.panels.modes import ModesPanel
 from escape_gui.settings import Settings
 from escape_gui.views.images import mask_from_rows
-from escape_gui.window.workspaces import WORKSPACES
+from escape_gui.window.docks import WORKSPACES
 from escape_hw.remote.source import Sample
 from escape_hw.remote.state import ActiveRun, Phase
 

@@ -14,11 +14,16 @@ from PySide6.QtWidgets import QLabel, QToolButton
 from escape_gui.client.availability import UNKNOWN_VALUE, has_frames
 from escape_gui.panels.base import Context, ExportArray, Panel
 from escape_gui.views.images import mask_from_rows, slope_map_pair
-from escape_gui.widgets.controls.buttons import SegmentedButton
-from escape_gui.widgets.images.image_viewer import DIVERGING_MAPS, SEQUENTIAL_MAPS, ImageToolbar, ImageViewer
-from escape_gui.widgets.images.quiver import Quiver, outline_points
-from escape_gui.widgets.layouts import row
-from escape_gui.widgets.plots.plot import Plot
+from escape_gui.widgets.controls import SegmentedButton, row
+from escape_gui.widgets.images import (
+    DIVERGING_MAPS,
+    SEQUENTIAL_MAPS,
+    ImageToolbar,
+    ImageViewer,
+    Quiver,
+    outline_points,
+)
+from escape_gui.widgets.plots import Plot
 from escape_hw.remote.source import DataSource, Sample
 from escape_hw.remote.state import Geometry, State
 

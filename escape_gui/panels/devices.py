@@ -7,8 +7,7 @@ from typing import ClassVar
 from PySide6.QtWidgets import QFrame, QLabel, QVBoxLayout, QWidget
 
 from escape_gui.panels.base import Context, Panel
-from escape_gui.widgets.controls.status_indicator import HEALTH_LEVELS, StatusIndicator
-from escape_gui.widgets.layouts import column, row, scroll_area, text_label
+from escape_gui.widgets.controls import HEALTH_LEVELS, StatusIndicator, column, row, scroll_area, text_label
 from escape_hw.remote.state import DeviceState, State
 
 #: Titles of the keys of ``[devices]``.

@@ -11,9 +11,7 @@ from PySide6.QtWidgets import QComboBox, QDoubleSpinBox, QGridLayout, QLabel, QP
 from escape_gui.client.availability import is_measured, reason_no_write, tooltip
 from escape_gui.panels.base import Context, Panel
 from escape_gui.views.loop_form import FIELDS, LoopSettingsEdit
-from escape_gui.widgets.controls.buttons import HoldButton
-from escape_gui.widgets.controls.status_indicator import Level, StatusIndicator
-from escape_gui.widgets.layouts import caption, row, text_label
+from escape_gui.widgets.controls import HoldButton, Level, StatusIndicator, caption, row, text_label
 from escape_hw.config.system import MAX_GAIN
 from escape_hw.remote.client import Connection
 from escape_hw.remote.source import DataSource

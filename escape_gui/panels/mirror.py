@@ -10,10 +10,8 @@ from numpy.typing import NDArray
 from escape_gui.client.availability import UNKNOWN_VALUE, is_measured
 from escape_gui.panels.base import Context, ExportArray, Panel
 from escape_gui.views.images import ActuatorImage
-from escape_gui.widgets.controls.buttons import SegmentedButton
-from escape_gui.widgets.controls.readout import Readout, readout_grid
-from escape_gui.widgets.images.image_viewer import DIVERGING_MAPS, ImageToolbar, ImageViewer
-from escape_gui.widgets.layouts import caption, row
+from escape_gui.widgets.controls import Readout, SegmentedButton, caption, readout_grid, row
+from escape_gui.widgets.images import DIVERGING_MAPS, ImageToolbar, ImageViewer
 from escape_hw.remote.source import DataSource, Sample
 from escape_hw.remote.state import Geometry, State
 

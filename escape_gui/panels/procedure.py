@@ -20,9 +20,9 @@ from escape_gui.client.availability import (
 )
 from escape_gui.panels.base import Context, Panel
 from escape_gui.views import procedure_form as form_text
-from escape_gui.views.mode_mosaic import ModeStatistics
-from escape_gui.widgets.controls.argument_form import ArgumentForm
-from escape_gui.widgets.layouts import row, scroll_area, text_label
+from escape_gui.views.mode_maps import ModeStatistics
+from escape_gui.widgets.argument_form import ArgumentForm
+from escape_gui.widgets.controls import row, scroll_area, text_label
 from escape_hw.remote.source import DataSource, Sample
 from escape_hw.remote.state import Arguments, FinishedRun, ProcedureEntry, ProcedurePlan, State
 

@@ -8,10 +8,7 @@ from PySide6.QtWidgets import QGridLayout, QHBoxLayout, QLabel, QPushButton, QWi
 
 from escape_gui.client.availability import UNKNOWN_VALUE, has_frames, is_measured
 from escape_gui.panels.base import Context
-from escape_gui.widgets.controls.buttons import HoldButton
-from escape_gui.widgets.controls.readout import Readout
-from escape_gui.widgets.controls.status_indicator import Level, StatusIndicator
-from escape_gui.widgets.layouts import column, row, text_label
+from escape_gui.widgets.controls import HoldButton, Level, Readout, StatusIndicator, column, row, text_label
 from escape_hw.remote.state import Phase, State
 
 PHASES: dict[Phase, Level] = {

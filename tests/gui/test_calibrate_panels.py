@@ -22,7 +22,7 @@ from escape_gui.panels.modes import LIVE_LABEL, ModesPanel
 from escape_gui.panels.procedure import ProcedurePanel
 from escape_gui.panels.sprint import SprintPanel
 from escape_gui.settings import Settings
-from escape_gui.widgets.images.map_tiles import best_columns
+from escape_gui.widgets.mode_maps import best_columns
 from escape_hw.api.registration import TO_STREAM_UNITS
 from escape_hw.io.documents import calibration_document
 from escape_hw.io.fits.matrix import save_matrix

@@ -25,7 +25,7 @@ from escape_gui.panels.loop import LoopPanel
 from escape_gui.panels.mirror import MirrorPanel
 from escape_gui.panels.performance import PerformancePanel
 from escape_gui.panels.psf import PsfPanel
-from escape_gui.widgets.controls.buttons import HOLD_MS
+from escape_gui.widgets.controls import HOLD_MS
 from escape_hw.errors import StorageError
 from escape_hw.remote.state import (
     DeviceHealth,

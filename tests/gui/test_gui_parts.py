@@ -19,8 +19,8 @@ from escape_gui.settings import Settings, load_settings, save_settings
 from escape_gui.theme import PALETTES, SCALES, Palette, Theme
 from escape_gui.views.images import MAP_GAP, ActuatorImage, RadialProfile, mask_from_rows, slope_map_pair
 from escape_gui.views.loop_form import LoopSettingsEdit
-from escape_gui.widgets.images.quiver import outline_points
-from escape_gui.widgets.plots.plot import TimeSeriesBuffer
+from escape_gui.widgets.images import outline_points
+from escape_gui.widgets.plots import TimeSeriesBuffer
 from escape_hw.cli.app import run
 from escape_hw.errors import ConfigError
 from escape_hw.remote.state import Geometry, LoopState

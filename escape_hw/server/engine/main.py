@@ -16,8 +16,7 @@ from escape_hw.runtime.session.system import System
 from escape_hw.server.engine.bench_owner import BenchOwner
 from escape_hw.server.engine.loop import LoopRunner
 from escape_hw.server.engine.product_store import ProductStore
-from escape_hw.server.engine.publisher import StreamPublisher
-from escape_hw.server.engine.recording import TelemetryRecording
+from escape_hw.server.engine.publisher import StreamPublisher, TelemetryRecording
 from escape_hw.server.engine.request_handler import RequestHandler
 from escape_hw.server.engine.runner import ProcedureRunner
 from escape_hw.server.engine.state import EngineState, LoopParameters

@@ -1,8 +1,9 @@
-"""Supervises the engine: starts it, applies the limits, kills it when it hangs, and reports its end."""
+"""Supervises the engine (start, limits, end), and holds the state that clients see."""
 
 from __future__ import annotations
 
 import logging
+import os
 import time
 from collections.abc import Callable
 from typing import Any
@@ -14,12 +15,33 @@ from escape_hw.errors import EscapeError
 from escape_hw.io.provenance import format_utc
 from escape_hw.remote.state import FaultState, Phase, State
 from escape_hw.server.frontend.engine_process import STOP_TIMEOUT_S, EngineProcess
-from escape_hw.server.frontend.published_state import PublishedState
+from escape_hw.server.frontend.lease import LeaseManager
+from escape_hw.server.frontend.transport import ZmqTransport
 from escape_hw.server.ipc.channel import EngineSetup
 from escape_hw.server.safety.journal import ServerJournal
 from escape_hw.server.safety.watchdog import Watchdog
 
 log = logging.getLogger(__name__)
+
+
+class PublishedState:
+    """Holds and publishes the state; its ``notes`` stay."""
+
+    def __init__(self, state: State, leases: LeaseManager, transport: ZmqTransport) -> None:
+        self.state, self._leases, self._transport = state, leases, transport
+
+    def update(self, state: State | None = None) -> None:
+        """Publish a new state of the engine, or the present one with new front-end values."""
+        before = self.state
+        self.state = (before if state is None else state).model_copy(
+            update={
+                "serial": before.serial + 1, "server_pid": os.getpid(), "lease": self._leases.lease,
+                "clients": self._leases.count, "refused_requests": self._transport.refused,
+                "notes": before.notes,
+            }
+        )  # fmt: skip
+        self._transport.publish("state", self.state)
+
 
 #: Seconds that an engine may be silent while its mirror is flat.
 IDLE_SILENCE_LIMIT_S = 120.0

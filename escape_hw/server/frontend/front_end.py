@@ -32,9 +32,8 @@ from escape_hw.remote.address import (
 from escape_hw.remote.keys import allowed_keys, server_keys
 from escape_hw.remote.source import STREAMS
 from escape_hw.remote.state import SCHEMA, FinishedRun, LogLine, Phase, State
-from escape_hw.server.frontend.engine_supervisor import EngineSupervisor
+from escape_hw.server.frontend.engine_supervisor import EngineSupervisor, PublishedState
 from escape_hw.server.frontend.lease import LeaseManager
-from escape_hw.server.frontend.published_state import PublishedState
 from escape_hw.server.frontend.transport import IncomingRequest, ZmqTransport
 from escape_hw.server.ipc.channel import EngineSetup
 from escape_hw.server.ipc.log import ServerLog

@@ -1,4 +1,4 @@
-"""The form of a procedure's arguments, made of what the server says of them."""
+"""Form for the arguments of a procedure, built from its description by the server."""
 
 from __future__ import annotations
 
