@@ -33,8 +33,6 @@ class LoadedProducts:
     #: By label; matrices in the order of ``_METHOD_ORDER``.
     matrices: dict[str, InteractionMatrix] = field(default_factory=dict)
     gains: dict[str, GainCurve] = field(default_factory=dict)
-    #: Reason by name of a product that could not be read.
-    errors: dict[str, str] = field(default_factory=dict)
 
 
 class ProductLibrary:
@@ -42,7 +40,7 @@ class ProductLibrary:
 
     def __init__(self) -> None:
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="escape-library")
-        self._futures: dict[tuple[str, str, int], Future[RunContent]] = {}
+        self._futures: dict[tuple[str, str, int], Future[RunContent | None]] = {}
         self._collected_keys: tuple[object, ...] = ()
         self._loaded = LoadedProducts()
         self._lock = threading.Lock()
@@ -85,27 +83,25 @@ def _key(product: ProductEntry) -> tuple[str, str, int]:
     return product.name, product.path, age
 
 
-def _read(path: Path) -> RunContent:
+def _read(path: Path) -> RunContent | None:
+    """Content of a product; ``None`` when it cannot be read, which is logged."""
     # Imported here: it takes half a second, and the window appears before.
     from escape_hw.report.content import read_product
 
-    return read_product(path)
+    try:
+        return read_product(path)
+    except Exception as error:
+        log.error("cannot read %s: %s", path, error, exc_info=not isinstance(error, EscapeError))
+        return None
 
 
-def _collect(ready: dict[tuple[str, str, int], Future[RunContent]]) -> LoadedProducts:
+def _collect(ready: dict[tuple[str, str, int], Future[RunContent | None]]) -> LoadedProducts:
     matrices: dict[str, InteractionMatrix] = {}
     gains: dict[str, GainCurve] = {}
-    errors: dict[str, str] = {}
-    for (name, path, _), future in ready.items():
-        error = future.exception()
-        if isinstance(error, EscapeError):
-            errors[name] = str(error)
-            continue
-        if error is not None:
-            log.error("cannot read %s", path, exc_info=error)
-            errors[name] = f"{path}: {error}"
-            continue
+    for (name, _, _), future in ready.items():
         run = future.result()
+        if run is None:
+            continue
         for label, matrix in run.matrices().items():
             _add_unique(matrices, label, name, matrix)
         for label, result in run.gains.items():
@@ -115,7 +111,7 @@ def _collect(ready: dict[tuple[str, str, int], Future[RunContent]]) -> LoadedPro
             gains |= {other: GainCurve.of(other, one) for other, one in result.comparisons.items()}
     rank = {method: k for k, method in enumerate(_METHOD_ORDER)}
     ordered = dict(sorted(matrices.items(), key=lambda item: rank.get(item[1].method, len(rank))))
-    return LoadedProducts(ordered, gains, errors)
+    return LoadedProducts(ordered, gains)
 
 
 def _add_unique(

@@ -15,7 +15,7 @@ from escape_gui.client.product_library import ProductLibrary
 from escape_hw.errors import EscapeError
 from escape_hw.remote.client import Connection
 from escape_hw.remote.source import DataSource, Sample
-from escape_hw.remote.state import Arguments, Geometry, LogLine, ProcedureEntry, ProcedurePlan, State
+from escape_hw.remote.state import Geometry, LogLine, ProcedureEntry, State
 
 log = logging.getLogger(__name__)
 T = TypeVar("T")
@@ -109,21 +109,19 @@ class EmptySource:
 
     connected = False
     state = State()
+    _geometry = Geometry()
 
     def latest(self, stream: str, after: int = -1) -> Sample | None:
         return None
 
     def geometry(self) -> Geometry:
-        return Geometry()
+        return self._geometry
 
     def log_after(self, number: int) -> Sequence[LogLine]:
         return ()
 
     def procedures(self) -> Sequence[ProcedureEntry]:
         return ()
-
-    def plan(self, procedure: str, arguments: Arguments) -> ProcedurePlan:
-        raise EscapeError("not connected to a server")
 
 
 class Session(QObject):

@@ -76,8 +76,7 @@ class _DeviceRow(QFrame):
         self._model.setObjectName("caption")
         head = row(self._name, None, self._indicator)
         column(head, self._model, self._facts, parent=self, spacing=0).setContentsMargins(4, 4, 4, 4)
-        context.theme.changed.connect(self._apply_theme)
-        self._apply_theme()
+        context.theme.follow(self._apply_theme)
 
     def show_device(self, device: DeviceState) -> None:
         role = ROLES.get(device.name, device.name)

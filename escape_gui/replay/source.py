@@ -16,10 +16,8 @@ from escape_hw.api.optical_gains import GainsResult
 from escape_hw.api.outlines import outlines
 from escape_hw.api.registration import PARAMETERS, TO_STREAM_UNITS
 from escape_hw.api.results import CalibrationResult, LoopResult, RegistrationEstimate
-from escape_hw.errors import ConfigError
 from escape_hw.remote.source import STREAMS, Sample
 from escape_hw.remote.state import (
-    Arguments,
     Finish,
     FinishedRun,
     Geometry,
@@ -27,7 +25,6 @@ from escape_hw.remote.state import (
     LoopState,
     Phase,
     ProcedureEntry,
-    ProcedurePlan,
     ProductEntry,
     State,
     StreamEntry,
@@ -153,8 +150,6 @@ def _table(track: Mapping[str, Any]) -> NDArray[np.float64]:
     return table
 
 
-#: Why nothing can be commanded.
-READ_ONLY_REASON = "replay of a recorded run: no procedure can be started"
 _LOG_LINE = re.compile(r"(\S+ \S+) ([A-Z]+) (\S+): (.*)")
 
 
@@ -243,10 +238,6 @@ class ReplaySource:
 
     def procedures(self) -> Sequence[ProcedureEntry]:
         return ()
-
-    def plan(self, procedure: str, arguments: Arguments) -> ProcedurePlan:
-        """Raise `ConfigError`: no procedure can be started in a replay."""
-        raise ConfigError(READ_ONLY_REASON)
 
 
 def _geometry_of(run: RunContent) -> Geometry:

@@ -194,8 +194,7 @@ class Readout(QWidget):
         self._value.setAlignment(Qt.AlignmentFlag.AlignRight | Qt.AlignmentFlag.AlignVCenter)
         row(caption(name), self._value, caption(unit), parent=self, spacing=4)
         self.setSizePolicy(QSizePolicy.Policy.Maximum, QSizePolicy.Policy.Fixed)
-        theme.changed.connect(self._apply_theme)
-        self._apply_theme()
+        theme.follow(self._apply_theme)
 
     @property
     def text(self) -> str:
@@ -254,8 +253,7 @@ class StatusIndicator(QWidget):
         self.level = Level.NEUTRAL
         self.text = ""
         self.setSizePolicy(QSizePolicy.Policy.Fixed, QSizePolicy.Policy.Fixed)
-        theme.changed.connect(self._apply_theme)
-        self._apply_theme()
+        theme.follow(self._apply_theme)
 
     def set_status(self, level: Level, text: str) -> None:
         if (level, text) == (self.level, self.text):
@@ -318,8 +316,7 @@ class Overlay(QFrame):
         head = row(self._title, None, close_button)
         column(head, self._text, parent=self).setContentsMargins(16, 12, 16, 16)
         window.installEventFilter(self)
-        theme.changed.connect(self._apply_theme)
-        self._apply_theme()
+        theme.follow(self._apply_theme)
         self.hide()
 
     def open(self, title: str, text: str, *, markdown: bool = False) -> None:

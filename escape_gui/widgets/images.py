@@ -87,8 +87,7 @@ class ImageViewer(QWidget):
         self.setMinimumSize(96, 96)
         self.view.scene().sigMouseMoved.connect(self._on_mouse_moved)
         self.view.scene().sigMouseClicked.connect(lambda _: self.setFocus())
-        theme.changed.connect(self._apply_theme)
-        self._apply_theme()
+        theme.follow(self._apply_theme)
         self.image.setColorMap(pg.colormap.get(self._maps[0]))
 
     # ------------------------------------------------------------ data
@@ -239,8 +238,7 @@ class ImageToolbar(QWidget):
         buttons.append(flat_button("Lock scale", "Lock the display range", checkable=True))
         buttons[-1].toggled.connect(lambda on: image_view.set_automatic(not on))
         row((self.cursor_value, 1), *buttons, parent=self, spacing=2)
-        theme.changed.connect(self._apply_theme)
-        self._apply_theme()
+        theme.follow(self._apply_theme)
 
     def _apply_theme(self) -> None:
         self.cursor_value.setFont(self._theme.font(0.9, mono=True))
@@ -262,8 +260,7 @@ class Quiver(pg.PlotCurveItem):  # type: ignore[misc]
         self._length = 1.0
         self.setZValue(4)
         self.setVisible(False)
-        theme.changed.connect(self.apply_theme)
-        self.apply_theme()
+        theme.follow(self.apply_theme)
 
     def set_geometry(self, geometry: Geometry) -> None:
         outlines = np.asarray(geometry.outlines_px, float).reshape(-1, 3)

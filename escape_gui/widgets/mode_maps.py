@@ -50,8 +50,7 @@ class ColourScale(QWidget):
         column(self._plot, parent=self)
         self._label = ""
         self._image.setLookupTable(lookup_table(name))
-        theme.changed.connect(self.apply_theme)
-        self.apply_theme()
+        theme.follow(self.apply_theme)
 
     def set_range(self, low: float, high: float, label: str) -> None:
         self._image.setRect(0, low, 1, high - low)
@@ -224,8 +223,7 @@ class ModeMosaic(QWidget):
         #: The selected mode, from 0; -1 if none.
         self.mode = -1
         self._build_view()
-        theme.changed.connect(self.apply_theme)
-        self.apply_theme()
+        theme.follow(self.apply_theme)
 
     def _build_view(self) -> None:
         self._view = pg.GraphicsView()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -50,8 +49,7 @@ class Plot(pg.PlotWidget):  # type: ignore[misc]
         self.setMinimumSize(120, 64)
         for side in ("left", "bottom"):
             self.getAxis(side).enableAutoSIPrefix(False)
-        theme.changed.connect(self.apply_theme)
-        self.apply_theme()
+        theme.follow(self.apply_theme)
 
     def curve(self, number: int, *, alone: bool = False, **options: Any) -> Any:
         """Add a curve in colour and dash ``number``, solid if ``alone``.
@@ -171,26 +169,19 @@ def style_axis(theme: Theme, axis: pg.AxisItem, label: str, colour: QColor | Non
     axis.setLabel(label, color=text.name(), **{"font-size": f"{theme.font(0.9).pointSizeF()}pt"})
 
 
-@dataclass(slots=True, eq=False)
 class ErrorCurve:
-    """A line with markers, and error bars."""
+    """Error bars and markers in colour, marker and dash ``number``; with a line if ``joined``."""
 
-    line: pg.PlotDataItem
-    bars: pg.ErrorBarItem
-
-    @classmethod
-    def make(cls, theme: Theme, number: int, *, joined: bool = True, size: float = 6.0) -> ErrorCurve:
-        """Create a curve in colour, marker and dash ``number``; without a line unless ``joined``."""
+    def __init__(self, theme: Theme, number: int, *, joined: bool = True, size: float = 6.0) -> None:
         colour = theme.series(number)
         pen = pg.mkPen(colour, width=1, style=DASHES[number % len(DASHES)]) if joined else None
-        line = pg.PlotDataItem(
+        self.line = pg.PlotDataItem(
             pen=pen, symbol=MARKERS[number % len(MARKERS)][0], symbolSize=size, symbolBrush=colour,
             symbolPen=None, connect="finite",
         )  # fmt: skip
         zero = np.zeros(1)
-        bars = pg.ErrorBarItem(x=zero, y=zero, height=zero, pen=pg.mkPen(colour, width=1))
-        bars.setVisible(False)
-        return cls(line, bars)
+        self.bars = pg.ErrorBarItem(x=zero, y=zero, height=zero, pen=pg.mkPen(colour, width=1))
+        self.bars.setVisible(False)
 
     def add_to(self, box: Any) -> None:
         box.addItem(self.bars)
@@ -327,7 +318,7 @@ class GainsPlot(PlotGrid):
         rounds = [pg.PlotCurveItem(pen=pg.mkPen(faint, width=1), connect="finite") for _ in range(n_earlier)]
         for one in rounds:
             box.addItem(one)
-        points = ErrorCurve.make(self._theme, number, joined=False, size=5.0)
+        points = ErrorCurve(self._theme, number, joined=False, size=5.0)
         points.add_to(box)
         trend = ErrorBand(colour, width=2.0)
         trend.add_to(box)
@@ -399,7 +390,7 @@ class ConvergencePlot(_ParameterGrid):
         self._curves: dict[int, ErrorCurve] = {}
         top = self._add_row(0, "Step norm", "", "")
         top.setLogMode(y=True)
-        self._norm = ErrorCurve.make(self._theme, 0)
+        self._norm = ErrorCurve(self._theme, 0)
         self._norm.add_to(top)
         groups = GROUPS if self.physical else (("Normalised", "", tuple(range(len(NAMES)))),)
         plots = [top]
@@ -407,7 +398,7 @@ class ConvergencePlot(_ParameterGrid):
             plot = self._add_row(row, title, unit, "Iteration" if row == len(groups) else "")
             plot.setXLink(top)
             for member in members:
-                self._curves[member] = ErrorCurve.make(self._theme, member)
+                self._curves[member] = ErrorCurve(self._theme, member)
                 self._curves[member].add_to(plot)
             plots.append(plot)
         self._marks = [reference_line(self._theme, 1, horizontal=False) for _ in plots]

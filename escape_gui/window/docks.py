@@ -64,8 +64,7 @@ class Dock(QDockWidget):
         self._title = QLabel(panel.title)
         self._indicator = StatusIndicator(theme)
         self.setTitleBarWidget(self._make_title())
-        theme.changed.connect(self._apply_theme)
-        self._apply_theme()
+        theme.follow(self._apply_theme)
 
     def _make_title(self) -> QWidget:
         name, title = self.panel.name, self.panel.title

@@ -9,7 +9,6 @@ import sys
 import threading
 import time
 import uuid
-import warnings
 from collections import deque
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
@@ -20,11 +19,12 @@ from typing import Any, Self
 import numpy as np
 
 from escape_hw.api.procedure import Progress
+from escape_hw.deprecation import renamed_members
 from escape_hw.errors import Aborted, CalibrationError, ClientUnknown, EscapeError, ServerGone
 from escape_hw.remote import requests as ask
 from escape_hw.remote.address import Endpoint, resolve
 from escape_hw.remote.keys import client_keys, keys_hint
-from escape_hw.remote.source import Sample
+from escape_hw.remote.source import Sample, present_stream
 from escape_hw.remote.state import (
     SCHEMA,
     ActiveRun,
@@ -183,6 +183,7 @@ _LINES = 5000
 _EVENT_S = 10.0
 
 
+@renamed_members(check="plan")
 class Connection:
     """A connection to a server, see :func:`connect`; implements :class:`~escape_hw.remote.source.DataSource`.
 
@@ -335,6 +336,7 @@ class Connection:
 
     def latest(self, stream: str, after: int = -1) -> Sample | None:
         """The newest entry of a stream; ``None`` when there is none newer than ``after``."""
+        stream = present_stream(stream)
         if not self._is_local:
             return self._latest_over_network(stream, after)
         segment = next((one.segment for one in self._state.streams if one.name == stream), None)
@@ -386,11 +388,6 @@ class Connection:
         """
         answer, _ = self._request("plan", SLOW_TIMEOUT_S, procedure=procedure, arguments=arguments or {})
         return ProcedurePlan.model_validate(answer)
-
-    def check(self, procedure: str, arguments: Arguments | None = None) -> ProcedurePlan:
-        """Plan a procedure; deprecated name of :meth:`plan`."""
-        warnings.warn("check() is now called plan()", DeprecationWarning, stacklevel=2)
-        return self.plan(procedure, arguments)
 
     def wait_for(self, run: int, timeout_s: float) -> FinishedRun | None:
         """The end of a run; ``None`` when it has not ended within the time-out."""

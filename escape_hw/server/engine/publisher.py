@@ -29,7 +29,7 @@ log = logging.getLogger(__name__)
 #: Least capacity of a ring's entry, so that growing arrays seldom need a new ring.
 _MIN_BYTES = 16384
 #: Entries kept of streams that are recorded at full rate; they bridge delays of the recorder.
-_SLOTS = {"frames": 16, "slopes": 64, "modes": 64, "commands": 64}
+_SLOTS = {"frames": 16, "slopes": 64, "residual_modes": 64, "commands": 64}
 
 
 class StreamPublisher:
@@ -66,7 +66,7 @@ class StreamPublisher:
 
     def set_full_scale(self, counts: float) -> None:
         """Set the value at which a pixel of the sensor's camera is saturated; part of every frame's entry."""
-        # "top" is the key of 0.1.0, which recorded files contain.
+        # "top" is the key of version 0.1.0; version 0.3.0 removes it.
         self._full_scale_meta = json.dumps({"full_scale": counts, "top": counts}).encode()
 
     @property
@@ -148,7 +148,7 @@ class StreamPublisher:
 
     def _residual(self, index: int, modes: NDArray[np.float32], rms: float) -> None:
         self.residual_nm = rms
-        self._write("modes", modes, index)
+        self._write("residual_modes", modes, index)
 
     def _write(
         self, name: str, data: NDArray[Any], index: int, exposed_ns: int = 0, meta: bytes = b""
@@ -159,7 +159,7 @@ class StreamPublisher:
 
 
 #: The streams with an entry for every frame.
-_RECORDED_STREAMS = ("frames", "slopes", "modes", "commands", "psf")
+_RECORDED_STREAMS = ("frames", "slopes", "residual_modes", "commands", "psf")
 
 
 class TelemetryRecording:

@@ -30,7 +30,7 @@ from escape_hw.remote.address import (
     unregister_server,
 )
 from escape_hw.remote.keys import allowed_keys, server_keys
-from escape_hw.remote.source import STREAMS
+from escape_hw.remote.source import RENAMED_STREAMS, STREAMS
 from escape_hw.remote.state import SCHEMA, FinishedRun, LogLine, Phase, State
 from escape_hw.server.frontend.engine_supervisor import EngineSupervisor, PublishedState
 from escape_hw.server.frontend.lease import LeaseManager
@@ -204,10 +204,11 @@ class FrontEnd:
 
     def _latest(self, request: requests.GetLatestSample) -> tuple[dict[str, Any] | None, bytes | None]:
         """Header and bytes of a stream's newest entry; ``None`` when there is none newer."""
-        if request.stream not in STREAMS:
-            raise RequestRefused(f"there is no stream '{request.stream}'; there are {', '.join(STREAMS)}")
-        segment = {one.name: one.segment for one in self._published.state.streams}.get(request.stream)
-        reader = self._readers.reader(request.stream, segment)
+        stream = RENAMED_STREAMS.get(request.stream, request.stream)
+        if stream not in STREAMS:
+            raise RequestRefused(f"there is no stream '{stream}'; there are {', '.join(STREAMS)}")
+        segment = {one.name: one.segment for one in self._published.state.streams}.get(stream)
+        reader = self._readers.reader(stream, segment)
         sample = None if reader is None else reader.latest(request.after)
         if sample is None:
             return None, None
