@@ -46,18 +46,9 @@ REPLAY_WORKSPACE = "calibrate"
 
 
 class MainWindow(QMainWindow):
-    """Window on one data source.
+    """Window on one data source, whose session it does not close.
 
-    Parameters
-    ----------
-    session
-        Data and requests; not closed by the window.
-    settings
-        Theme, font size and layouts.
-    settings_path
-        File in which the settings are saved on closing; ``None``: not saved.
-    panels
-        Classes of the panels to create.
+    The settings are saved into the file ``settings_path``, if given, on closing.
     """
 
     def __init__(

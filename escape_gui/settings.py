@@ -33,15 +33,7 @@ def settings_file() -> Path:
 
 
 def load_settings(path: Path) -> tuple[Settings, tuple[str, ...]]:
-    """Read settings and ignore invalid entries.
-
-    Returns
-    -------
-    settings : Settings
-        Valid entries, and defaults for the others.
-    warnings : tuple of str
-        One line per ignored entry; empty for a valid or missing file.
-    """
+    """Read settings; invalid entries are ignored, with a warning for each."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:

@@ -154,17 +154,9 @@ _LOG_LINE = re.compile(r"(\S+ \S+) ([A-Z]+) (\S+): (.*)")
 
 
 class ReplaySource:
-    """Products and log of a run as a :class:`~escape_hw.remote.source.DataSource`.
+    """A FITS product or the folder of a run as a :class:`~escape_hw.remote.source.DataSource`.
 
-    Parameters
-    ----------
-    path
-        A FITS product or the folder of a run.
-
-    Raises
-    ------
-    ProductError
-        The path is neither a run nor a product, or a file is damaged.
+    ProductError: the path is neither, or a file is damaged.
     """
 
     connected = True

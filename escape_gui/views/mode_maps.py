@@ -112,14 +112,9 @@ class ModeStatistics:
 def normalise_modes(
     data: NDArray[np.floating], statistics: ModeStatistics, weight_by_snr: bool
 ) -> NDArray[np.float32]:
-    """Divide each mode by its rms slope, for a common symmetric scale (paper: IM figures).
+    """Divide each mode of a matrix ``(n_slopes, n_modes)`` by its rms slope (paper: IM figures).
 
-    Parameters
-    ----------
-    data
-        Matrix ``(n_slopes, n_modes)``.
-    weight_by_snr
-        Multiply by the Wiener weight; otherwise noise looks like a strong mode.
+    ``weight_by_snr`` multiplies by the Wiener weight; otherwise noise looks like a strong mode.
     """
     scale = np.divide(1.0, statistics.rms, out=np.zeros_like(statistics.rms), where=statistics.rms > 0)
     if weight_by_snr:
@@ -148,17 +143,7 @@ def pages(layout: MosaicLayout, n_modes: int) -> int:
 def render_page(
     layout: MosaicLayout, valid: NDArray[np.bool_], values: NDArray[np.float32], modes: range
 ) -> NDArray[np.uint8]:
-    """Image of a page: colour indices as of :func:`colour_indices`.
-
-    Parameters
-    ----------
-    valid
-        Valid sub-apertures ``(rows, columns)``.
-    values
-        Normalised matrix ``(n_slopes, n_modes)``, see :func:`normalise_modes`.
-    modes
-        Modes of the page.
-    """
+    """Colour indices of a page, from ``valid`` ``(rows, columns)`` and normalised ``(n_slopes, n_modes)``."""
     image = np.full(layout.size, OUTSIDE, np.uint8)
     rows, columns = layout.shape
     indices = colour_indices(values[:, modes.start : modes.stop])
@@ -189,32 +174,17 @@ class MapTile:
     signed: bool
 
 
-def tiles(
-    matrices: Mapping[str, InteractionMatrix], mode: int, compared: tuple[str, str] | None = None
-) -> list[MapTile]:
-    """Tiles of one mode.
+def tiles(matrices: Mapping[str, InteractionMatrix], mode: int) -> list[MapTile]:
+    """Tiles of one mode, index from 0; matrices by label, in display order.
 
-    Parameters
-    ----------
-    matrices
-        By label, in display order; matrices without the mode are left out.
-    mode
-        Index from 0.
-    compared
-        Labels of the two matrices whose difference is shown; by default the last and the first.
-
-    Returns
-    -------
-    list of MapTile
-        Slopes of each matrix divided by their rms; the difference of two matrices; standard error and
-        signal-to-noise ratio of the last matrix with standard errors.
+    Slopes of each matrix that has the mode, divided by their rms; the difference of the last and the first
+    matrix; standard error and signal-to-noise ratio of the last matrix with standard errors.
     """
     available = {label: one for label, one in matrices.items() if mode < one.n_modes}
     shown = [_slope_tile(label, one, mode) for label, one in available.items()]
-    if compared is None and len(available) > 1:
+    if len(available) > 1:
         labels = list(available)
         compared = (labels[-1], labels[0])
-    if compared is not None and set(compared) <= set(available):
         shown += _difference_tile(compared, available[compared[0]], available[compared[1]], mode)
     with_errors = [(label, one) for label, one in available.items() if np.any(one.sigma[:, mode] > 0)]
     if with_errors:

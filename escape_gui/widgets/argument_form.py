@@ -135,13 +135,7 @@ class ArgumentForm(QWidget):
         self.edited.emit()
 
     def arguments(self) -> Arguments:
-        """What stands in the form; arguments at their defaults are left out.
-
-        Raises
-        ------
-        ValueError
-            A field holds what cannot be meant; says which and what would do.
-        """
+        """Values that differ from their defaults (ValueError: invalid field; gives the allowed values)."""
         values: Arguments = {}
         for one in self._parameters:
             field = self.fields[one.name]

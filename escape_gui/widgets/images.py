@@ -33,14 +33,8 @@ _CURSOR_STEPS = {
 class ImageViewer(QWidget):
     """Shows an array with square pixels and the first row at the top.
 
-    Parameters
-    ----------
-    maps
-        Names of the colour maps that the key M cycles through.
-    symmetric
-        Display range symmetric about zero.
-    min_level
-        Minimum of the upper level of a symmetric display range.
+    The key M cycles through the colour maps ``maps``. A ``symmetric`` display range is symmetric about zero,
+    its upper level at least ``min_level``.
     """
 
     #: Position and value under the cursor, as text.
@@ -286,15 +280,7 @@ class Quiver(pg.PlotCurveItem):  # type: ignore[misc]
 def outline_points(outlines: Sequence[tuple[float, float, float]]) -> NDArray[np.float64]:
     """Squares around sub-apertures, or circles around the pupils of a pyramid sensor.
 
-    Parameters
-    ----------
-    outlines
-        Centre x, y and half width of each, in pixels.
-
-    Returns
-    -------
-    ndarray
-        Points ``(2, n_points)``, NaN between the outlines.
+    Points ``(2, n_points)``, NaN between the outlines, from centre x, y and half width of each in pixels.
     """
     circles = len(outlines) <= _MAX_PUPILS
     angle = np.linspace(0, 2 * np.pi, 49) if circles else np.pi / 4 + np.linspace(0, 2 * np.pi, 5)

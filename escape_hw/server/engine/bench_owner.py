@@ -33,12 +33,7 @@ REOPEN_REMEDY = "Fix the device, then clear the fault to open the devices again.
 class BenchOwner:
     """Owns the devices. All methods but those of the first group belong to the main thread.
 
-    Attributes
-    ----------
-    bench, state, publisher, state_publisher
-        The bench and its state, and who publishes them.
-    send
-        Sends a message to the front end.
+    ``send`` sends a message to the front end.
     """
 
     def __init__(

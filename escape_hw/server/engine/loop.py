@@ -29,28 +29,21 @@ OnClosed = Callable[[EscapeError | None], object]
 
 
 class LoopRunner:
-    """Closes the loop and changes its parameters.
-
-    Attributes
-    ----------
-    model_psf
-        PSF without turbulence ``(rows, columns)``, once measured; the running Strehl ratio needs it.
-    """
+    """Closes the loop and changes its parameters."""
 
     def __init__(self, owner: BenchOwner, product_store: ProductStore) -> None:
         self._owner, self._bench, self._state = owner, owner.bench, owner.state
         #: A procedure replaces the bench's configuration while it runs.
         self._config = owner.bench.config
         self._product_store = product_store
+        #: PSF without turbulence ``(rows, columns)``, once measured; the running Strehl ratio needs it.
         self.model_psf: NDArray[np.float32] | None = None
 
     def prepare(self, request: CloseLoop | LoopParameters) -> tuple[LoopParameters, LoopControl]:
         """Load the matrix and compute the reconstructor; nothing moves.
 
-        Raises
-        ------
-        ConfigError, ProductError, IncompatibleProduct, CalibrationError
-            A parameter is out of range, or the matrix does not fit this bench.
+        ConfigError, ProductError, IncompatibleProduct or CalibrationError: a parameter is out of range, or
+        the matrix does not fit this bench.
         """
         settings = self._merge(request)
         control = LoopControl(

@@ -31,13 +31,7 @@ def offered_parameters(procedure: type[ProcedureSpec[Any]]) -> tuple[Parameter, 
 
 
 class ProcedureRegistry:
-    """The procedures that a server offers for its system.
-
-    Parameters
-    ----------
-    config
-        The system's configuration; it has the defaults of many parameters.
-    """
+    """The procedures that a server offers for its system, whose configuration has many of the defaults."""
 
     def __init__(self, config: SystemConfig) -> None:
         self._config = config
@@ -68,13 +62,7 @@ class ProcedureRegistry:
         return ",".join(value) if isinstance(value, tuple) else value
 
     def arguments(self, name: str, given: Arguments) -> Arguments:
-        """All arguments of a procedure, defaults included.
-
-        Raises
-        ------
-        ConfigError
-            There is no such procedure, or an argument is wrong.
-        """
+        """All arguments of a procedure, defaults included (ConfigError: unknown name, wrong argument)."""
         parameters = offered_parameters(find_procedure(name))
         values = check_arguments(map(_as_sent, parameters), given)
         defaults = {one.name: self._default(one) for one in parameters}
@@ -83,12 +71,8 @@ class ProcedureRegistry:
     def task(self, name: str, given: Arguments, product_store: ProductStore) -> ProcedureSpec[Any]:
         """The request for a run with these arguments.
 
-        A resumed run keeps its own arguments and settings where none are given.
-
-        Raises
-        ------
-        ConfigError, ProductError
-            An argument is wrong, a matrix is unknown, or the run cannot be resumed.
+        A resumed run keeps its own arguments and settings where none are given. ConfigError or ProductError:
+        an argument is wrong, a matrix is unknown, or the run cannot be resumed.
         """
         procedure = find_procedure(name)
         parameters = offered_parameters(procedure)
@@ -126,26 +110,14 @@ _CLIPPED_WARNING_SHARE = 0.05
 
 
 class ProcedurePlanner:
-    """Plans procedures on a bench.
-
-    Parameters
-    ----------
-    bench
-        An open bench; nothing is moved.
-    """
+    """Plans procedures on an open bench; nothing is moved."""
 
     def __init__(self, bench: Bench) -> None:
         self._bench = bench
         self._m2c: NDArray[np.float64] | None = None
 
     def plan(self, name: str, arguments: Arguments) -> ProcedurePlan:
-        """The plan of a procedure; ``arguments`` are complete.
-
-        Raises
-        ------
-        EscapeError
-            The modal basis cannot be computed.
-        """
+        """The plan of a procedure; ``arguments`` are complete (EscapeError: no modal basis)."""
         rate = self._bench.wfs.settings.frame_rate_hz
         procedure = find_procedure(name)
         frames, random_pokes = procedure.planned_frames(self._bench, arguments), procedure.random_pokes

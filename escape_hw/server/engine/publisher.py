@@ -33,12 +33,7 @@ _SLOTS = {"frames": 16, "slopes": 64, "residual_modes": 64, "commands": 64}
 
 
 class StreamPublisher:
-    """One ring per stream, created with its first entry.
-
-    Parameters
-    ----------
-    system
-        Name of the system, part of the segments' names.
+    """One ring per stream, created with its first entry. ``system`` is part of the segments' names.
 
     Attributes
     ----------

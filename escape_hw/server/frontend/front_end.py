@@ -8,7 +8,6 @@ import os
 import time
 from contextlib import ExitStack
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 import zmq
@@ -264,17 +263,8 @@ class ClientKeyCheck:
 class Server:
     """A listening server with its sockets and its entry in the user's list; a context manager.
 
-    Parameters
-    ----------
-    config
-        The system.
-    host, port
-        TCP address to listen on in addition to the local sockets; none without a port.
-
-    Raises
-    ------
-    ConfigError
-        The system is served already, or the address is not available.
+    It listens on local sockets and, with a ``port``, on TCP as well. ConfigError: the system is served
+    already, or the address is not available.
     """
 
     def __init__(self, config: SystemConfig, host: str = "127.0.0.1", port: int | None = None) -> None:
@@ -321,7 +311,5 @@ class Server:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._stack.close()
