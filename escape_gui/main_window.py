@@ -321,7 +321,7 @@ class MainWindow(QMainWindow):
         The safety buttons of a window on a bench must remain those of the bench.
         """
         session = self.context.session
-        if session.requests is None:
+        if session.control is None:
             session.set_source(source, None)
             self.show_workspace(REPLAY_WORKSPACE)
             return

@@ -21,89 +21,6 @@ log = logging.getLogger(__name__)
 T = TypeVar("T")
 
 
-class RequestSender(QObject):
-    """Sends requests from worker threads and delivers the answers in the window's thread.
-
-    Safety requests have a thread of their own, so that none waits for a slow request.
-    """
-
-    #: Name of the request, and why it failed.
-    failed = Signal(str, str)
-    #: Number of requests without an answer.
-    pending_changed = Signal(int)
-    _delivered = Signal(object)
-
-    def __init__(self, control: Connection) -> None:
-        super().__init__()
-        self.control = control
-        self._executors = {
-            urgent: ThreadPoolExecutor(1, f"escape-gui-{'safety' if urgent else 'request'}")
-            for urgent in (False, True)
-        }
-        self._pending = 0
-        self._accepting = True
-        self._delivered.connect(lambda deliver: deliver(), Qt.ConnectionType.QueuedConnection)
-
-    def ask(
-        self,
-        what: str,
-        call: Callable[[Connection], T],
-        on_result: Callable[[T], None] | None = None,
-        on_error: Callable[[str], None] | None = None,
-        *,
-        urgent: bool = False,
-        quiet: bool = False,
-    ) -> None:
-        """Send a request; returns at once.
-
-        Parameters
-        ----------
-        what
-            Name of the request for messages, as in ``Could not close the loop``.
-        call
-            Makes the request; runs in a worker thread and must not touch widgets.
-        on_result, on_error
-            Called in the window's thread with the answer or with the reason of the failure.
-        urgent
-            A safety request.
-        quiet
-            Do not emit :attr:`failed`: ``on_error`` reports the failure.
-        """
-        if not self._accepting:
-            return
-
-        def deliver(future: Future[T]) -> None:
-            if not self._accepting:
-                return
-            self._change_pending(-1)
-            error = future.exception()
-            if error is None:
-                if on_result is not None:
-                    on_result(future.result())
-                return
-            if not isinstance(error, EscapeError):
-                log.error("%s failed unexpectedly", what, exc_info=error)
-            reason = str(error) or type(error).__name__
-            if not quiet:
-                self.failed.emit(what, reason)
-            if on_error is not None:
-                on_error(reason)
-
-        self._change_pending(+1)
-        future = self._executors[urgent].submit(call, self.control)
-        future.add_done_callback(lambda answer: self._delivered.emit(partial(deliver, answer)))
-
-    def _change_pending(self, step: int) -> None:
-        self._pending += step
-        self.pending_changed.emit(self._pending)
-
-    def close(self) -> None:
-        """Stop the threads; answers that still arrive are discarded."""
-        self._accepting = False
-        for worker in self._executors.values():
-            worker.shutdown(wait=True, cancel_futures=True)
-
-
 class EmptySource:
     """Source without data, shown before a window is connected."""
 
@@ -125,35 +42,92 @@ class EmptySource:
 
 
 class Session(QObject):
-    """Data source of a window and sender of its requests; both change when another source is opened."""
+    """Data source of a window and sender of its requests; both change when another source is opened.
+
+    Worker threads send the requests, and the answers are delivered in the window's thread. Safety requests
+    have a thread of their own, so that none waits for a slow request.
+    """
 
     #: The source was replaced; panels clear their content.
     changed = Signal()
+    #: Name of a request, and why it failed.
     failed = Signal(str, str)
+    #: Number of requests without an answer.
     pending_changed = Signal(int)
+    _delivered = Signal(object)
 
     def __init__(self) -> None:
         super().__init__()
         self.source: DataSource = EmptySource()
-        #: ``None`` in replay and before a connection.
-        self.requests: RequestSender | None = None
+        #: Receives the requests; ``None`` in replay and before a connection.
+        self.control: Connection | None = None
         #: Products listed by the source, loaded for the panels.
         self.library = ProductLibrary()
+        self._executors: dict[bool, ThreadPoolExecutor] = {}
+        self._pending = 0
+        self._delivered.connect(lambda deliver: deliver(), Qt.ConnectionType.QueuedConnection)
 
     def set_source(self, source: DataSource, control: Connection | None) -> None:
         """Replace the source; without ``control`` no requests can be sent."""
         self._close_requests()
-        self.source = source
-        if control is not None:
-            self.requests = RequestSender(control)
-            self.requests.failed.connect(self.failed)
-            self.requests.pending_changed.connect(self.pending_changed)
+        self.source, self.control = source, control
         self.changed.emit()
 
-    def ask(self, what: str, call: Callable[[Connection], object], *, urgent: bool = False) -> None:
-        """Send a request without waiting for its result; does nothing without a server."""
-        if self.requests is not None:
-            self.requests.ask(what, call, urgent=urgent)
+    def ask(
+        self,
+        what: str,
+        call: Callable[[Connection], T],
+        on_result: Callable[[T], None] | None = None,
+        on_error: Callable[[str], None] | None = None,
+        *,
+        urgent: bool = False,
+        quiet: bool = False,
+    ) -> None:
+        """Send a request; returns at once, and does nothing without a server.
+
+        Parameters
+        ----------
+        what
+            Name of the request for messages, as in ``Could not close the loop``.
+        call
+            Makes the request; runs in a worker thread and must not touch widgets.
+        on_result, on_error
+            Called in the window's thread with the answer or with the reason of the failure.
+        urgent
+            A safety request.
+        quiet
+            Do not emit :attr:`failed`: ``on_error`` reports the failure.
+        """
+        control = self.control
+        if control is None:
+            return
+
+        def deliver(future: Future[T]) -> None:
+            if self.control is not control:
+                return
+            self._set_pending(self._pending - 1)
+            error = future.exception()
+            if error is None:
+                if on_result is not None:
+                    on_result(future.result())
+                return
+            if not isinstance(error, EscapeError):
+                log.error("%s failed unexpectedly", what, exc_info=error)
+            reason = str(error) or type(error).__name__
+            if not quiet:
+                self.failed.emit(what, reason)
+            if on_error is not None:
+                on_error(reason)
+
+        self._set_pending(self._pending + 1)
+        if urgent not in self._executors:
+            self._executors[urgent] = ThreadPoolExecutor(1, f"escape-gui-{'safety' if urgent else 'request'}")
+        future = self._executors[urgent].submit(call, control)
+        future.add_done_callback(lambda answer: self._delivered.emit(partial(deliver, answer)))
+
+    def _set_pending(self, number: int) -> None:
+        self._pending = number
+        self.pending_changed.emit(number)
 
     def toggle_pause(self) -> None:
         """Request to pause the running procedure, or to resume it if it is paused."""
@@ -170,15 +144,13 @@ class Session(QObject):
     @property
     def live(self) -> bool:
         """Whether the source is, or will be, a server rather than a recorded run."""
-        return self.requests is not None or isinstance(self.source, EmptySource)
+        return self.control is not None or isinstance(self.source, EmptySource)
 
     @property
     def may_write(self) -> bool:
         """Whether this client holds the lease."""
         lease = self.source.state.lease
-        return (
-            self.requests is not None and lease is not None and lease.client == self.requests.control.client
-        )
+        return self.control is not None and lease is not None and lease.client == self.control.client
 
     @property
     def request_context(self) -> RequestContext:
@@ -191,7 +163,10 @@ class Session(QObject):
         self.source = EmptySource()
 
     def _close_requests(self) -> None:
-        if self.requests is not None:
-            self.requests.close()
-            self.requests.deleteLater()
-            self.requests = None
+        """Stop the threads; answers that still arrive are discarded."""
+        self.control = None
+        for worker in self._executors.values():
+            worker.shutdown(wait=True, cancel_futures=True)
+        self._executors.clear()
+        if self._pending:
+            self._set_pending(0)

@@ -25,6 +25,7 @@ from PySide6.QtWidgets import (
     QWidget,
 )
 
+from escape_gui.client.availability import tooltip
 from escape_gui.theme import Theme
 from escape_hw.remote.state import DeviceHealth
 
@@ -83,6 +84,12 @@ def flat_button(text: str, tip: str, *, checkable: bool = False, checked: bool =
     button.setCheckable(checkable)
     button.setChecked(checked)
     return button
+
+
+def set_available(button: QPushButton, tip: str, reason: str) -> None:
+    """Enable a button, or disable it and give the reason in its tooltip."""
+    button.setEnabled(not reason)
+    button.setToolTip(tooltip(tip, reason))
 
 
 def scroll_area(content: QWidget | None = None) -> QScrollArea:

@@ -17,7 +17,7 @@ from escape_gui.theme import Theme
 from escape_gui.views import mode_maps as mode_views
 from escape_gui.views.mode_maps import MapTile, ModeStatistics, MosaicLayout, colour_indices
 from escape_gui.widgets.controls import column
-from escape_gui.widgets.plots import reparent_menu
+from escape_gui.widgets.plots import reparent_menu, style_axis
 
 #: Colour maps for signed values and for magnitudes, suitable for any colour vision.
 DIVERGING, SEQUENTIAL = "CET-D1A", "cividis"
@@ -59,15 +59,8 @@ class ColourScale(QWidget):
         self.apply_theme()
 
     def apply_theme(self) -> None:
-        text = self._theme.colour("text")
         self._plot.setBackground(self._theme.colour("panel"))
-        axis = self._plot.getAxis("right")
-        axis.setPen(self._theme.colour("line"))
-        axis.setTextPen(text)
-        axis.setTickFont(self._theme.font(0.9))
-        axis.setLabel(
-            self._label, color=text.name(), **{"font-size": f"{self._theme.font(0.9).pointSizeF()}pt"}
-        )
+        style_axis(self._theme, self._plot.getAxis("right"), self._label)
         self.setFixedWidth(self._theme.pixels(64))
 
 

@@ -203,7 +203,7 @@ class ScriptedSource:
         n_slopes = 2 * sum(row.count("1") for row in self.geometry_data.valid)
         geometry = self.geometry_data
         n_act = sum(row.count("1") for row in geometry.layout) or len(geometry.positions_m)
-        self.push("frames", spots(self.geometry_data, seed=seed), top=1023.0)
+        self.push("frames", spots(self.geometry_data, seed=seed), full_scale=1023.0)
         self.push("slopes", rng.normal(0, 0.4, n_slopes))
         self.push("commands", rng.normal(0, 0.1, n_act))
         self.push("residual_modes", rng.normal(0, 20, self.geometry_data.n_modes))

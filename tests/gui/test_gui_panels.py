@@ -108,7 +108,7 @@ def test_camera_counts_and_hatches_saturation(window: MainWindow, source: Script
     camera = panel_of(window, CameraPanel)
     frame = np.zeros((400, 400), np.uint16)
     frame[7, 9] = 1023
-    source.push("frames", frame, top=1023.0)
+    source.push("frames", frame, full_scale=1023.0)
     source.change(illumination=Illumination(saturated=0.0321, peak=1.0))
     camera._histogram_due = 0.0
     window.update_timer.tick(force=True)

@@ -115,12 +115,13 @@ def main() -> None:
         signal.signal(number, signal.SIG_IGN)
     settings = FailsafeSettings.model_validate_json(sys.stdin.buffer.read())
     if not wait_for_end(int(sys.argv[1])):
-        from escape_hw.io.storage import write_atomic
-
-        report = make_safe(settings)
-        # The next start of the server shows it.
-        path = Path(settings.incidents) / f"{report.system}-{report.pid}.incident.json"
-        write_atomic(path, report.model_dump_json().encode())
+        report, folder = make_safe(settings), Path(settings.incidents)
+        # The next start of the server shows it. Written also when the disk is nearly full.
+        folder.mkdir(parents=True, exist_ok=True)
+        path = folder / f"{report.system}-{report.pid}.incident.json"
+        temporary = path.with_suffix(".tmp")
+        temporary.write_text(report.model_dump_json(), encoding="utf-8")
+        temporary.replace(path)
 
 
 if __name__ == "__main__":
