@@ -96,7 +96,7 @@ class Panel(QWidget):
         self._last_sample_s = 0.0
         self.health = DeviceHealth.STALE
         #: Positions of the sub-apertures and actuators; empty before the sensor was measured.
-        self.geometry = Geometry()
+        self.bench_geometry = Geometry()
         #: Set by subclasses: :meth:`redraw` is called at the end of the refresh.
         self.dirty = False
         self.show_placeholder(bool(self.placeholder))
@@ -121,8 +121,8 @@ class Panel(QWidget):
                 self.show_placeholder(False)
                 self.on_sample(stream, sample)
         geometry = source.geometry()
-        if geometry is not self.geometry:
-            self.geometry = geometry
+        if geometry is not self.bench_geometry:
+            self.bench_geometry = geometry
             self.on_geometry()
         self.tick(source)
         if self.dirty:
@@ -146,7 +146,7 @@ class Panel(QWidget):
         self._last_index.clear()
         self._state_serial = self._engine_pid = -1
         self._last_sample_s = 0.0
-        self.geometry = Geometry()
+        self.bench_geometry = Geometry()
         self.on_geometry()
         self.clear()
         self.show_placeholder(bool(self.placeholder))
@@ -172,7 +172,7 @@ class Panel(QWidget):
         """Process a new entry of a stream."""
 
     def on_geometry(self) -> None:
-        """Process a new :attr:`geometry`."""
+        """Process a new :attr:`bench_geometry`."""
 
     def tick(self, source: DataSource) -> None:
         """Process everything else, such as the log; called at each refresh, after the samples."""

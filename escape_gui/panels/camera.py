@@ -94,9 +94,9 @@ class CameraPanel(Panel):
 
     # ------------------------------------------------------------ data
     def on_geometry(self) -> None:
-        self._valid = mask_from_rows(self.geometry.valid)
-        self._outlines.setData(*outline_points(self.geometry.outlines_px), connect="finite")
-        self.quiver.set_geometry(self.geometry)
+        self._valid = mask_from_rows(self.bench_geometry.valid)
+        self._outlines.setData(*outline_points(self.bench_geometry.outlines_px), connect="finite")
+        self.quiver.set_geometry(self.bench_geometry)
 
     def on_state(self, state: State) -> None:
         light = state.illumination

@@ -56,12 +56,12 @@ class MirrorPanel(Panel):
         self.body.addWidget(ImageToolbar(theme, self.image_view, logarithmic=False))
         self.body.addLayout(readout_grid(self.readouts))
         self._values: dict[str, NDArray[Any]] = {}
-        self._map = ActuatorImage(self.geometry)
+        self._map = ActuatorImage(self.bench_geometry)
         self._update_measured_button()
         self.apply_theme()
 
     def on_geometry(self) -> None:
-        self._map = ActuatorImage(self.geometry)
+        self._map = ActuatorImage(self.bench_geometry)
         self.image_view.clear()
         self._update_image()
 

@@ -51,17 +51,7 @@ _SERVER_TIMEOUT_S = 15.0
 
 
 class RemoteRun:
-    """A run on a server.
-
-    Parameters
-    ----------
-    connection
-        Connection to the server.
-    id
-        Number of the run.
-    name
-        Name of the procedure.
-    """
+    """A run on a server: its number ``id``, and the ``name`` of its procedure."""
 
     def __init__(self, connection: Connection, id: int, name: str) -> None:
         self._connection, self.id, self.name = connection, id, name
@@ -127,7 +117,12 @@ class RemoteRun:
                     )
                 self._require_engine()
                 if view is not None and (running := self.running) is not None:
-                    view(_progress(running))
+                    view(
+                        Progress(
+                            running.stage, running.completed, running.total, running.unit, running.elapsed_s,
+                            running.metrics,
+                        )
+                    )  # fmt: skip
         return self._result(ended)
 
     def _require_engine(self) -> None:
@@ -159,12 +154,6 @@ def load_result(ended: FinishedRun) -> Any:
         if path is not None and Path(path).is_file():
             return load(path).result  # type: ignore[attr-defined]
     return ended.document or None
-
-
-def _progress(running: ActiveRun) -> Progress:
-    return Progress(
-        running.stage, running.completed, running.total, running.unit, running.elapsed_s, running.metrics
-    )
 
 
 def _program() -> str:

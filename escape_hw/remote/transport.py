@@ -63,10 +63,7 @@ class ClientTransport:
         self._requests = self._socket(zmq.DEALER, endpoint.requests, keys)
         self._events = self._socket(zmq.SUB, endpoint.events, keys)
         self._events.setsockopt(zmq.SUBSCRIBE, b"")
-        self._wake_receiver, self._wake_sender = (
-            self._context.socket(zmq.PAIR),
-            self._context.socket(zmq.PAIR),
-        )
+        self._wake_receiver, self._wake_sender = (self._context.socket(zmq.PAIR) for _ in range(2))
         self._wake_receiver.bind("inproc://wake")
         self._wake_sender.connect("inproc://wake")
         self._lock = threading.Lock()
@@ -148,16 +145,11 @@ class ClientTransport:
                 self._receive_events()
             if self._requests in ready:
                 self._receive_reply()
-            if (
-                time.monotonic() - last_heartbeat_s > self._heartbeat_s
-                and (message := self._next_heartbeat()) is not None
-            ):
-                last_heartbeat_s = time.monotonic()
-                self._send(_HEARTBEAT_ID, json.dumps(message).encode())
-
-    def _next_heartbeat(self) -> Mapping[str, Any] | None:
-        refused, self._heartbeat_refused = self._heartbeat_refused, False
-        return self._heartbeat(refused)
+            if time.monotonic() - last_heartbeat_s > self._heartbeat_s:
+                refused, self._heartbeat_refused = self._heartbeat_refused, False
+                if (message := self._heartbeat(refused)) is not None:
+                    last_heartbeat_s = time.monotonic()
+                    self._send(_HEARTBEAT_ID, json.dumps(message).encode())
 
     def _send_all(self) -> None:
         while True:

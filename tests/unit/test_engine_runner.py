@@ -16,9 +16,8 @@ from escape_hw.api.procedure import Progress
 from escape_hw.errors import DeviceLost, EscapeError, RequestRefused
 from escape_hw.remote.requests import CloseLoop
 from escape_hw.remote.state import Finish, FinishedRun, Phase
-from escape_hw.server.engine import loop, runner
-from escape_hw.server.engine.loop import LoopRunner
-from escape_hw.server.engine.runner import ProcedureRunner
+from escape_hw.server.engine import runner
+from escape_hw.server.engine.runner import LoopRunner, ProcedureRunner
 from escape_hw.server.engine.state import EngineState, LoopParameters
 from escape_hw.server.engine.state_publisher import StatePublisher
 from escape_hw.server.frontend.engine_process import EngineProcess
@@ -71,9 +70,9 @@ class Owner:
 
 @pytest.fixture
 def owner(monkeypatch: pytest.MonkeyPatch) -> Owner:
-    monkeypatch.setattr(loop, "load_fitting_matrix", lambda *args: SimpleNamespace(result=None))
-    monkeypatch.setattr(loop, "require_hardware_matrix", lambda *args, **options: None)
-    monkeypatch.setattr(loop, "LoopControl", lambda *args, **options: loop_control())
+    monkeypatch.setattr(runner, "load_fitting_matrix", lambda *args: SimpleNamespace(result=None))
+    monkeypatch.setattr(runner, "require_hardware_matrix", lambda *args, **options: None)
+    monkeypatch.setattr(runner, "LoopControl", lambda *args, **options: loop_control())
     owner = Owner()
     monkeypatch.setattr(runner, "load_text", lambda text, overrides: owner.bench.config)
     return owner
@@ -208,7 +207,7 @@ def process() -> Any:
     """The front end's side of an engine whose fail-safe process is dead, and a clock."""
     made: Any = EngineProcess.__new__(EngineProcess)
     made.now = 1000.0
-    made._failsafe, made._backoff = SimpleNamespace(pid=4711), Backoff(lambda: made.now)
+    made.failsafe, made._backoff = SimpleNamespace(pid=4711), Backoff(lambda: made.now)
     return made
 
 
@@ -222,7 +221,7 @@ def test_a_fail_safe_process_that_cannot_be_started_does_not_end_the_server(
     process.now += 1
     with caplog.at_level(logging.ERROR):
         process.maintain_failsafe(alive=False)
-    assert process._failsafe.pid == 4711
+    assert process.failsafe.pid == 4711
     assert "next attempt in 2 s: Resource temporarily unavailable" in caplog.text
 
 

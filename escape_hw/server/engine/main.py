@@ -14,11 +14,10 @@ from escape_hw.config.loader import load_text
 from escape_hw.remote.state import State
 from escape_hw.runtime.session.system import System
 from escape_hw.server.engine.bench_owner import BenchOwner
-from escape_hw.server.engine.loop import LoopRunner
 from escape_hw.server.engine.product_store import ProductStore
 from escape_hw.server.engine.publisher import StreamPublisher, TelemetryRecording
 from escape_hw.server.engine.request_handler import RequestHandler
-from escape_hw.server.engine.runner import ProcedureRunner
+from escape_hw.server.engine.runner import LoopRunner, ProcedureRunner
 from escape_hw.server.engine.state import EngineState, LoopParameters
 from escape_hw.server.engine.state_publisher import StatePublisher
 from escape_hw.server.ipc.channel import Channel, EngineSetup

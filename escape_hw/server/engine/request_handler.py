@@ -12,11 +12,10 @@ from escape_hw.errors import ConfigError, RequestRefused
 from escape_hw.remote import requests
 from escape_hw.remote.requests import error_to_document
 from escape_hw.server.engine.bench_owner import BenchOwner
-from escape_hw.server.engine.loop import LoopRunner
 from escape_hw.server.engine.procedures import ProcedurePlanner, ProcedureRegistry, needs_loop
 from escape_hw.server.engine.product_store import ProductStore
 from escape_hw.server.engine.publisher import TelemetryRecording
-from escape_hw.server.engine.runner import LOOP_IS_RESTORED, ProcedureRunner
+from escape_hw.server.engine.runner import LOOP_IS_RESTORED, LoopRunner, ProcedureRunner
 from escape_hw.server.engine.state_publisher import geometry_of
 
 log = logging.getLogger(__name__)

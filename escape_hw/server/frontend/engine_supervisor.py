@@ -80,12 +80,12 @@ class EngineSupervisor:
     def start(self) -> None:
         """Start an engine."""
         self._engine = EngineProcess(self._setup, str(self._journal.folder))
-        log.info("engine of %s: process %d", self._journal.system, self._engine.pid)
+        log.info("engine of %s: process %d", self._journal.system, self._engine.process.pid)
 
     @property
     def running_engine(self) -> EngineProcess | None:
         """The engine, ``None`` when there is none or it has died."""
-        return self._engine if self._engine is not None and self._engine.running else None
+        return self._engine if self._engine is not None and self._engine.process.running else None
 
     @property
     def has_ended(self) -> bool:
@@ -157,11 +157,11 @@ class EngineSupervisor:
             return
         engine.flush()
         # Read before the engine's own state: the fail-safe process ends only after its engine.
-        due, failsafe_is_running = now - self._last_heartbeat_s > _HEARTBEAT_S, engine.failsafe_is_running
+        due, failsafe_is_running = now - self._last_heartbeat_s > _HEARTBEAT_S, engine.failsafe.running
         if due:
             self._last_heartbeat_s = now
             engine.send({"heartbeat": True})
-        if not engine.running:
+        if not engine.process.running:
             self._on_engine_exit(engine)
             return
         if due:
@@ -182,7 +182,7 @@ class EngineSupervisor:
         if not self._kill_reason:
             self._kill_reason = reason
             log.error("%s; it is killed, and the fail-safe process makes the mirror safe", reason)
-            engine.kill()
+            engine.process.kill()
 
     def _on_engine_exit(self, engine: EngineProcess) -> None:
         """Report the end of the engine; called again until the fail-safe process has ended, too."""
@@ -192,14 +192,14 @@ class EngineSupervisor:
             engine.close()
             self._engine, self.stopping = None, True
             return
-        why = self._kill_reason or f"the engine (process {engine.pid}) died"
-        if engine.failsafe_is_running:
+        why = self._kill_reason or f"the engine (process {engine.process.pid}) died"
+        if engine.failsafe.running:
             if self._published.state.engine_pid:
                 self._publish_fault(f"{why}; the fail-safe process makes the mirror safe")
             return
         engine.close()
         self._engine, self._kill_reason = None, ""
-        report = self._journal.read_incident(engine.pid)
+        report = self._journal.read_incident(engine.process.pid)
         no_report = "the fail-safe process left no report; check the mirror"
         self._publish_fault(f"{why}; {no_report if report is None else report.mirror}")
         self.stopping = self._stop_requested_s is not None
