@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import threading
 from collections.abc import Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -36,39 +35,31 @@ class LoadedProducts:
 
 
 class ProductLibrary:
-    """Reads each product once in a worker thread and provides the results as :class:`LoadedProducts`."""
+    """Reads each product once in a worker thread; all methods belong to the window's thread."""
 
     def __init__(self) -> None:
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="escape-library")
         self._futures: dict[tuple[str, str, int], Future[RunContent | None]] = {}
         self._collected_keys: tuple[object, ...] = ()
         self._loaded = LoadedProducts()
-        self._lock = threading.Lock()
 
     def request(self, products: Iterable[ProductEntry]) -> None:
         """Start to read these matrices and gains, and drop others; returns at once."""
         known = {_key(one): one for one in products if one.kind in ("matrix", "gains")}
-        with self._lock:
-            for key in [key for key in self._futures if key not in known]:
-                del self._futures[key]
-            for key, one in known.items():
-                if key not in self._futures:
-                    self._futures[key] = self._pool.submit(_read, Path(one.path))
-
-    @property
-    def is_reading(self) -> bool:
-        with self._lock:
-            return any(not one.done() for one in self._futures.values())
+        for key in self._futures.keys() - known.keys():
+            del self._futures[key]
+        for key, one in known.items():
+            if key not in self._futures:
+                self._futures[key] = self._pool.submit(_read, Path(one.path))
 
     @property
     def loaded(self) -> LoadedProducts:
         """The products read so far; the same object until another one is ready."""
-        with self._lock:
-            ready = {key: one for key, one in self._futures.items() if one.done()}
-            if tuple(ready) != self._collected_keys:
-                self._collected_keys = tuple(ready)
-                self._loaded = _collect(ready)
-            return self._loaded
+        ready = {key: one for key, one in self._futures.items() if one.done()}
+        if tuple(ready) != self._collected_keys:
+            self._collected_keys = tuple(ready)
+            self._loaded = _collect(ready)
+        return self._loaded
 
     def close(self) -> None:
         self._pool.shutdown(wait=True, cancel_futures=True)

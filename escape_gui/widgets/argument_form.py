@@ -107,17 +107,6 @@ class ArgumentForm(QWidget):
         line.textEdited.connect(self.edited)
         return line
 
-    def set_value(self, name: str, text: str) -> None:
-        """Enter a value into a field."""
-        field = self.fields[name]
-        if isinstance(field, QLineEdit):
-            field.setText(text)
-        elif isinstance(field, QComboBox):
-            field.setCurrentText(text)
-        elif isinstance(field, QCheckBox):
-            field.setChecked(text == "True")
-        self.edited.emit()
-
     def arguments(self) -> Arguments:
         """Values that differ from their defaults (ValueError: invalid field; gives the allowed values)."""
         values: Arguments = {}

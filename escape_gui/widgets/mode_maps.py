@@ -118,16 +118,12 @@ class MapTiles(QWidget):
     def __init__(self, theme: Theme) -> None:
         super().__init__()
         self._theme, self._columns = theme, 2
-        self._tiles: tuple[MapTile, ...] = ()
+        self.tiles: tuple[MapTile, ...] = ()
         self._tile_widgets: list[tuple[QWidget, QLabel, MapImage]] = []
         self._grid = QGridLayout(self)
         self._grid.setContentsMargins(4, 4, 4, 4)
         self._grid.setSpacing(8)
         theme.changed.connect(self.apply_theme)
-
-    @property
-    def titles(self) -> tuple[str, ...]:
-        return tuple(one.title for one in self._tiles)
 
     def resizeEvent(self, event: QResizeEvent) -> None:
         super().resizeEvent(event)
@@ -135,21 +131,21 @@ class MapTiles(QWidget):
 
     def _arrange(self) -> None:
         title = 4 * self._theme.pixels(_LINE)
-        columns = best_columns(len(self._tiles), self.width(), self.height(), title)
+        columns = best_columns(len(self.tiles), self.width(), self.height(), title)
         if columns != self._columns:
             self._columns = columns
             for number, (holder, _, _) in enumerate(self._tile_widgets):
                 self._grid.addWidget(holder, *divmod(number, columns))
 
     def show_tiles(self, tiles: Sequence[MapTile]) -> None:
-        self._tiles = tuple(tiles)
-        while len(self._tile_widgets) < len(self._tiles):
+        self.tiles = tuple(tiles)
+        while len(self._tile_widgets) < len(self.tiles):
             self._add_tile_widget()
         for number, (holder, title, image) in enumerate(self._tile_widgets):
-            holder.setVisible(number < len(self._tiles))
-            if number < len(self._tiles):
-                title.setText(self._title(self._tiles[number]))
-                image.show_tile(self._tiles[number])
+            holder.setVisible(number < len(self.tiles))
+            if number < len(self.tiles):
+                title.setText(self._title(self.tiles[number]))
+                image.show_tile(self.tiles[number])
         self._arrange()
 
     def _add_tile_widget(self) -> None:
@@ -171,7 +167,7 @@ class MapTiles(QWidget):
     def apply_theme(self) -> None:
         for _, title, _ in self._tile_widgets:
             title.setFont(self._theme.font(0.9))
-        self.show_tiles(self._tiles)
+        self.show_tiles(self.tiles)
 
 
 #: Minimum width of a mode's pair of maps at font scale 1, pixels.

@@ -29,7 +29,7 @@ def library():
 
 
 def read_all(library):
-    while library.is_reading:
+    while not all(one.done() for one in library._futures.values()):
         pass
     return library.loaded
 
