@@ -111,9 +111,8 @@ def export_milk(
         if file.suffix == ".npy":
             _publish(name, read_file(file).data, version)
             context.show(f"{name}: {shm_path(name)}")
-            context.result(
-                {**header_fields("export milk", None, None, None), "files": {name: shm_path(name)}}
-            )
+            document = header_fields("export milk", None, None, None)
+            context.result({**document, "files": {name: shm_path(name)}})
             return
         product = load_matrix(file)
         images = calibration_images(product.result, _system_config(product).devices.dm.actuator_map())
