@@ -26,6 +26,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
+from realisation_tables import append_line, read_lines, study_parser
 
 from escape_hw.api.procedure import Progress
 from escape_hw.api.registration import PARAMETERS, Registration
@@ -54,9 +55,7 @@ LABELS = {"knows": "knows the truth, no pokes", "never": "never looks, no pokes"
 
 def read_comparison(out: Path, loop: str) -> NDArray[np.float64]:
     """Looks at another loop so far ``(n, 3)``: end in seconds, Strehl ratio, its error."""
-    path = out / f"{loop}.jsonl"
-    lines = path.read_text().splitlines() if path.exists() else []
-    return np.array(sorted(json.loads(line) for line in lines)).reshape(-1, 3)
+    return np.array(sorted(read_lines(out / f"{loop}.jsonl"))).reshape(-1, 3)
 
 
 def draw(out: Path, figure: Path) -> None:
@@ -351,8 +350,7 @@ class ProgressLog:
         if progress.stage != "tracking" or progress.done == self._last or not progress.metrics:
             return
         self._last = progress.done
-        with self._path.open("a") as lines:
-            lines.write(json.dumps({"second": progress.done, **progress.metrics}) + "\n")
+        append_line(self._path, {"second": progress.done, **progress.metrics})
         if progress.done % 20 == 0:
             print(f"{progress.done} of {progress.total} s", flush=True)
 
@@ -399,8 +397,7 @@ def compare(options: argparse.Namespace) -> None:
                 data = gain * matrix_at(bench, result, twin.flexure.at(at + COMPARISON_S / 2))
                 matrix = replace(matrix, data=data.astype(np.float32))
             one = [float(end), *measure_strehl(bench, result, psf, at, matrix)]
-            with (options.out / f"{options.loop}.jsonl").open("a") as lines:
-                lines.write(json.dumps(one) + "\n")
+            append_line(options.out / f"{options.loop}.jsonl", one)
             print(options.loop, *(f"{value:.4f}" for value in one), flush=True)
 
 
@@ -415,11 +412,8 @@ def comparison_times(tracked: dict[str, Any], looks: int) -> NDArray[np.float64]
 
 def main() -> None:
     """Parse, and do one of the three."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = study_parser(__doc__, "razor-shwfs")
     parser.add_argument("what", choices=["track", "compare", "draw"])
-    parser.add_argument("--system", default="razor-shwfs")
     parser.add_argument("--seconds", type=float, default=600.0)
     parser.add_argument(
         "--drift", type=float, default=20.0, help="shift x over the run, %% of a sub-aperture"
@@ -433,7 +427,6 @@ def main() -> None:
     parser.add_argument("--loop", choices=["knows", "never"], default="knows", help="what compare closes")
     parser.add_argument("--seed", type=int, default=5)
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
-    parser.add_argument("--out", type=Path, default=Path("."))
     parser.add_argument("--figure", type=Path, default=Path("tracking.png"))
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
