@@ -202,13 +202,11 @@ def sky_time(
     Parameters
     ----------
     system
-        Name or path of a system, or its configuration; it is simulated.
+        Name or path of a system, or its configuration; it is simulated, with the overrides.
     realisations
         Number of random registrations.
     frames
         Numbers of frames at which to estimate, ascending.
-    overrides
-        Configuration overrides, ``section.key=value`` each.
     workers
         Parallel processes.
 

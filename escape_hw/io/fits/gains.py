@@ -96,7 +96,11 @@ def _unpack_round(rows: NDArray[np.float64], scalars: dict[str, Any]) -> GainRou
     if strehl is not None:
         strehl = StrehlEstimate(**{method: Estimate(**value) for method, value in strehl.items()})
     fields_of_round = {name: scalars[name] for name in _ROUND_FIELDS}
-    return GainRound(OpticalGains(*rows, float(scalars["common_sigma"])), strehl=strehl, **fields_of_round)
+    return GainRound(_unpack_gains(rows, scalars["common_sigma"]), strehl=strehl, **fields_of_round)
+
+
+def _unpack_gains(rows: NDArray[np.float64], common_sigma: float) -> OpticalGains:
+    return OpticalGains(**dict(zip(_VECTOR_NAMES, rows, strict=True)), common_sigma=float(common_sigma))
 
 
 def _unpack(path: Path, hdus: astropy_fits.HDUList, header: dict[str, Any]) -> GainsResult:
@@ -115,7 +119,7 @@ def _unpack(path: Path, hdus: astropy_fits.HDUList, header: dict[str, Any]) -> G
         frames=int(run["frames"]),
         lost_frames=int(run["lost_frames"]),
         comparisons={
-            name: OpticalGains(*rows, float(common_sigma))
+            name: _unpack_gains(rows, common_sigma)
             for rows, (name, common_sigma) in zip(others, run["beside"].items(), strict=True)
         },
         partial=header["FINISH"] == "aborted",

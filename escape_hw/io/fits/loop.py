@@ -88,7 +88,8 @@ def load_loop(path: Path | str) -> LoopProduct:
 
 def _unpack(path: Path, hdus: astropy_fits.HDUList, header: dict[str, Any]) -> LoopResult:
     run = fits_parts.unpack_metrics(path, hdus, "RUN")
-    images = {
+    fields: dict[str, Any] = {name: kind(run[name]) for name, kind in _SCALARS.items()}
+    fields |= {
         name: fits_file.read_array(path, hdus, extension, dtype)
         for name, (extension, dtype, _unit) in _IMAGES.items()
         if extension in hdus
@@ -106,6 +107,5 @@ def _unpack(path: Path, hdus: astropy_fits.HDUList, header: dict[str, Any]) -> L
         partial=header["FINISH"] == "aborted",
         notes=tuple(str(note) for note in run["notes"]),
         gain_sigma=run.get("gain_sigma"),
-        **{name: kind(run[name]) for name, kind in _SCALARS.items()},
-        **images,
+        **fields,
     )
