@@ -43,6 +43,7 @@ from escape_hw.pipeline.psf.strehl import strehl
 from escape_hw.report.figures import style
 from escape_hw.runtime.session.system import System, open_system
 from escape_sim.devices.bench import SimBench
+from escape_sim.devices.true_optical_gains import get_simulated_bench
 
 #: Seconds of tracking that are not judged.
 SETTLED_S = 10.0
@@ -226,14 +227,6 @@ def load_or_make_start(options: argparse.Namespace) -> tuple[CalibrationResult, 
     return load_matrix(matrix).result, np.load(image)
 
 
-def twin_of(bench: System) -> SimBench:
-    """The simulated bench behind a system."""
-    twin = getattr(bench.dm, "twin", None)
-    if not isinstance(twin, SimBench):
-        raise SystemExit(f"{bench.config.system.name} has no twin with a truth to look at")
-    return twin
-
-
 class WavefrontRms:
     """Keeps the rms of the wavefront in front of the sensor, mirror included, of every moment it is seen."""
 
@@ -310,7 +303,7 @@ def run_tracker(options: argparse.Namespace) -> None:
     """Run the tracker and write what it said beside the truth."""
     result, psf = load_or_make_start(options)
     with open_bench(options) as bench:
-        twin = twin_of(bench)
+        twin = get_simulated_bench(bench)
         origin = twin.now_s
         ripples = WavefrontRms(twin)
         frozen = WavefrontSampler(
@@ -361,7 +354,7 @@ def measure_strehl(
     """Strehl ratio of a loop closed for a few seconds at a moment of the twin's clock; 0 where it is lost."""
     prepare_sensor(bench)
     bench.dm.flatten()
-    twin_of(bench).advance_to(at_s - CLOSING_S)
+    get_simulated_bench(bench).advance_to(at_s - CLOSING_S)
     control = build_integrator(bench, matrix, result.grid)
     loop = RunningLoop(bench, matrix.m2c, build_slope_function(bench, result.grid), control, science=True)
     rate = bench.wfs.settings.frame_rate_hz
@@ -387,7 +380,7 @@ def compare(options: argparse.Namespace) -> None:
     gains = np.array(tracked["gains"])
     done = read_comparison(options.out, options.loop)
     with open_bench(options) as bench:
-        twin = twin_of(bench)
+        twin = get_simulated_bench(bench)
         for end in comparison_times(tracked, options.looks):
             if any(abs(end - one[0]) < COMPARISON_S for one in done):
                 continue

@@ -47,7 +47,8 @@ class PaperCase:
     """One of the paper's results.
 
     ``kind`` is its name on the command line, ``frames`` the numbers of frames by keyword of the
-    ``procedure``, which takes an open bench. ``save`` saves the result, checks its criteria and writes the report.
+    ``procedure``, which takes an open bench. ``save`` saves the result, checks its criteria and writes the
+    report.
     """
 
     kind: str

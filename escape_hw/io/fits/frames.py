@@ -75,10 +75,6 @@ class RecordedFrames:
         Monotonic time of the end of each exposure and of its arrival ``(n_frames,)``, nanoseconds.
     n_saturated
         Pixels at the top of the scale ``(n_frames,)``.
-    camera, serial
-        What took them.
-    settings
-        As they were in force.
     """
 
     data: NDArray[np.uint16]

@@ -45,14 +45,7 @@ class MatrixProduct(Product[CalibrationResult]):
 def save_matrix(path: Path | str, result: CalibrationResult, origin: Provenance | None = None) -> Path:
     """Write a calibration's matrix with grid, errors, basis, registration and configuration.
 
-    Parameters
-    ----------
-    path
-        File name; the result of an aborted run is written as ``*.partial.fits``.
-    result
-        What a calibration procedure returned.
-    origin
-        Where it comes from.
+    The result of an aborted run is written as ``*.partial.fits``.
 
     Returns
     -------

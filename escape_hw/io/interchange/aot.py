@@ -281,18 +281,7 @@ def _to_cube(rows: Any) -> Any:
 class AotContent:
     """Contents of an AOT file for one loop.
 
-    Parameters
-    ----------
-    system
-        Name of the system, as the file gives it.
-    geometry
-        Of the sensor.
-    calibration
-        The matrix with its modes, where the file has one.
-    telemetry
-        Slopes and commands, where it has both.
-    config_text
-        The configuration it carries.
+    ``calibration`` is the matrix with its modes, ``telemetry`` slopes and commands, where the file has them.
     """
 
     system: str
@@ -307,8 +296,6 @@ def read_aot(path: Path | str, stroke_m: float | None = None, loop: str = "") ->
 
     Parameters
     ----------
-    path
-        The file.
     stroke_m
         Metres of surface for a command of 1; the file's own by default.
     loop

@@ -16,12 +16,7 @@ def calibration_images(
 ) -> dict[str, NDArray[Any]]:
     """The calibration as arrays by the ending of their names.
 
-    Parameters
-    ----------
-    result
-        The calibration.
-    layout
-        Map of the actuators; ``None`` where they are not on a grid.
+    ``actuator_map`` is ``None`` where the actuators are not on a grid.
 
     Returns
     -------

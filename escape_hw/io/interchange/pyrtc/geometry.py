@@ -123,10 +123,8 @@ class PyrtcLenslets:
 
         Parameters
         ----------
-        mask
-            Valid sub-apertures ``(2 n, n)``.
-        references
-            Reference slopes ``(2 n, n)``, pixels.
+        mask, references
+            Valid sub-apertures and reference slopes ``(2 n, n)``, pixels.
         n_sub
             Sub-apertures across the pupil by our design; the grid is so large.
 
