@@ -90,7 +90,8 @@ def draw_psfs(
 
     All images are scaled to the model's flux. Logarithmic stretch relative to the model's maximum,
     backgrounds subtracted; the three Strehl ratios stand below each in the paper's order: peak, optical
-    transfer function, encircled energy. Axes are in lambda/D where ``psf_px`` gives it in pixels, else in pixels.
+    transfer function, encircled energy. Axes are in lambda/D where ``psf_px`` gives it in pixels, else in
+    pixels.
     """
     shown, model = _loops_with_images(loops), _model_psf(loops)
     images = {label: _subtract_background(loop.psf) for label, loop in shown.items() if loop.psf is not None}
