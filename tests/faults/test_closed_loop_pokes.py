@@ -118,7 +118,7 @@ def test_faults_that_bias_nothing(closed_loop, truth, more, allowed):
     if "loss" in more[0]:
         assert found.lost_frames == pytest.approx(3000 * 0.05 / 0.95, abs=60)
     if "limits" in more[0]:
-        assert found.matrix.metrics["shortened"] > 30
+        assert found.matrix.metrics["clipped_pokes"] > 30
         assert any("limits shortened" in note for note in found.notes)
 
 

@@ -193,7 +193,7 @@ def test_product_of_an_unknown_kind_is_refused(
 ) -> None:
     from escape_hw.io.fits import extensions as fits_geometry
 
-    monkeypatch.setitem(fits_geometry._CONVERTERS, "curvature", fits_geometry._CONVERTERS["pyramid"])
+    monkeypatch.setitem(fits_geometry._CARDS, "curvature", fits_geometry._CARDS["pyramid"])
     monkeypatch.setattr(PyramidPupils, "kind", "curvature")
     path = save_matrix(tmp_path / "im.fits", measured)
     monkeypatch.undo()

@@ -337,4 +337,4 @@ def test_picture_of_a_run(tmp_path):
 
 def test_sky_time_is_told_in_words_too(page):
     assert "rms over 20 random registrations" in page
-    assert "Fewest frames that meet every goal: whitened 500, plain none of these." in page
+    assert "Fewest frames that meet every goal: whitened 500, unwhitened none of these." in page

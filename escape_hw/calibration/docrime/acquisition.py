@@ -117,7 +117,9 @@ class OpenLoopAcquisition:
                     if is_due and (yield from self._check_progress()):
                         return False
                     if report.due():
-                        yield report(done + 1, self._preview_arrays(preview), shortened=float(self.shortened))
+                        yield report(
+                            done + 1, self._preview_arrays(preview), clipped_pokes=float(self.shortened)
+                        )
             except Aborted:
                 yield from self._check_progress(final=True)
                 return True

@@ -202,7 +202,7 @@ def docrime_closed_run(
         raise
     residual = select_settled_residual(loop.record, bench.wfs.settings.frame_rate_hz)
     matrix = build_solution_matrix(
-        bench, grid, m2c, solution, method, poke=float(poke), shortened=loop.record.shortened,
+        bench, grid, m2c, solution, method, poke=float(poke), clipped_pokes=loop.record.shortened,
         skipped=loop.skipped, loop_gain=bench.config.loop.gain,
         loop_residual_nm=float(np.sqrt(np.mean(np.square(residual)))) if residual.size else math.nan,
     )  # fmt: skip

@@ -108,7 +108,7 @@ def docrime_run(
         raise
     method = pattern.method + ("-whitened" if whiten and issubclass(pattern, RandomPokes) else "")
     matrix = build_solution_matrix(
-        bench, acquisition.grid, m2c, solution, method, poke=float(poke), shortened=acquisition.shortened
+        bench, acquisition.grid, m2c, solution, method, poke=float(poke), clipped_pokes=acquisition.shortened
     )
     return DocrimeRun(_result(acquisition, matrix, solution, partial), solution, acquisition.record())
 

@@ -157,7 +157,7 @@ def _build_result(
     synthetic = synthesise_calibration(bench, grid, fit.estimate, m2c)
     metrics = {
         **synthetic.matrix.metrics, "frames": frames, "lost_frames": lost, "poke": poke,
-        "shortened": shortened, "delay_frames": fit.response.delay, "whitening_order": order,
+        "clipped_pokes": shortened, "delay_frames": fit.response.delay, "whitening_order": order,
     }  # fmt: skip
     return replace(
         synthetic,
