@@ -9,11 +9,12 @@ from small_pyramid import configuration
 
 from escape_sim.oopao.library import make_pyramid, make_source, oopao_classes, suppress_output
 from escape_sim.oopao.optics import OOPAOPyramid
+from escape_sim.optics.base import ModulatedOptics
 from escape_sim.optics.fourier_filter import next_fast_length
 from escape_sim.optics.modulation import ModulationPath
 from escape_sim.optics.pupil import pupil_geometry
 from escape_sim.optics.pyramid import Prism, PyramidOptics
-from escape_sim.optics.sensor import ModulatedOptics, make_sensor_optics
+from escape_sim.optics.sensor import make_sensor_optics
 
 WAVELENGTH = 635e-9
 #: Single precision of the fast optics, relative to the brightest pixel.

@@ -98,6 +98,12 @@ class SourceAndTelescope:
     telescope: Any
     photons_per_unit: float
 
+    def propagate(self, opd_m: NDArray[np.floating], sensor: Any) -> None:
+        """Propagate the light with an optical path ``(n, n)`` in metres to a sensor."""
+        with suppress_output():
+            # '**' starts a new propagation; '*' would add to the last one.
+            self.source**self.telescope * oopao_classes().OPD_map(np.asarray(opd_m, dtype=float)) * sensor
+
 
 def make_source(amplitude: NDArray[np.float32], diameter_m: float, wavelength_m: float) -> SourceAndTelescope:
     """Source and telescope for a pupil amplitude ``(n, n)`` whose side is ``diameter_m``."""

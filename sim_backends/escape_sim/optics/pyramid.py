@@ -14,6 +14,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from escape_hw.api.concurrency import helper_threads_allowed
+from escape_sim.optics.base import ModulatedOptics
 from escape_sim.optics.fourier_filter import FourierFilter, is_fast_length, next_fast_length
 from escape_sim.optics.modulation import ModulationPath
 from escape_sim.optics.shack_hartmann import pupil_field
@@ -259,7 +260,7 @@ WORKERS = 2
 Method = Literal["auto", "separable", "fourier"]
 
 
-class PyramidOptics:
+class PyramidOptics(ModulatedOptics):
     """Pyramid sensor: four images of the pupil on one camera.
 
     A camera pixel is one pupil sample, or a whole number of them. A positive slope of the optical path
@@ -318,8 +319,7 @@ class PyramidOptics:
             raise ValueError(f"amplitude has shape {amplitude.shape}; it must be square, of even side")
         if samples < 1 or not diameter_px > 0:
             raise ValueError(f"{samples} samples per pixel, {diameter_px} pixels; both must be positive")
-        self.shape = shape
-        self.amplitude = np.ascontiguousarray(amplitude, dtype=np.float32)
+        super().__init__(amplitude, shape)
         self._diameter, self.wavelength_m = diameter_px * samples, wavelength_m
         grid = next_fast_length(max(shape), samples) if grid_px is None else grid_px
         if grid * samples < n or grid * samples % 2:
@@ -334,14 +334,7 @@ class PyramidOptics:
         self._executor = ThreadPoolExecutor(WORKERS - 1, "pyramid") if helper_threads_allowed() else None
         self.modulation = modulation
 
-    @property
-    def modulation(self) -> ModulationPath:
-        """Path of the image over the pyramid; may be set between frames."""
-        return self._modulation
-
-    @modulation.setter
-    def modulation(self, modulation: ModulationPath) -> None:
-        self._modulation = modulation
+    def _apply_modulation(self, modulation: ModulationPath) -> None:
         kernel = self._kernels[0]
         tilts_per_sample = modulation.points / self._diameter
         x, y = kernel.tilts(tilts_per_sample[:, 0]), kernel.tilts(tilts_per_sample[:, 1])
@@ -353,17 +346,7 @@ class PyramidOptics:
         """Method in use, ``separable`` or ``fourier``."""
         return "separable" if isinstance(self._kernels[0], SeparableKernel) else "fourier"
 
-    def frame(
-        self, opd_m: NDArray[np.float32], image: NDArray[np.float32] | None = None
-    ) -> NDArray[np.float32]:
-        """Add the mean intensity ``(rows, columns)`` to ``image``, a new array by default, and return it.
-
-        ``opd_m (n, n)`` is the optical path difference in metres. The intensity sums to the sum of
-        ``amplitude ** 2``, except for light outside the region.
-        """
-        if opd_m.shape != self.amplitude.shape:
-            raise ValueError(f"the optical path has shape {opd_m.shape}, the pupil {self.amplitude.shape}")
-        out = np.zeros(self.shape, np.float32) if image is None else image
+    def _add_intensity(self, opd_m: NDArray[np.floating], out: NDArray[np.floating]) -> None:
         opd = np.ascontiguousarray(opd_m, dtype=np.float32)
         field = self._field.view(np.float32).reshape(-1, 2)
         pupil_field(opd.ravel(), 1 / self.wavelength_m, self.amplitude.ravel(), field)
@@ -377,7 +360,6 @@ class PyramidOptics:
                 future.result()
         for power in self._power:
             self._region_on_camera.add(power, out)
-        return out
 
     def _propagate_share(self, worker: int) -> None:
         """Compute the power of one worker's modulation points."""

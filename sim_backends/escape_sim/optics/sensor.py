@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Protocol, runtime_checkable
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from escape_hw.config.sensor import PyramidSection, ShackHartmannSection
+from escape_sim.optics.base import ModulatedOptics, SensorOptics
 from escape_sim.optics.modulation import ModulationPath
 from escape_sim.optics.pupil import PupilGeometry
 from escape_sim.optics.pyramid import PyramidOptics
@@ -16,22 +17,6 @@ from escape_sim.optics.shack_hartmann import ShackHartmannOptics
 if TYPE_CHECKING:
     from escape_hw.config.system import SystemConfig
     from escape_sim.oopao.optics import OOPAOPyramid
-
-
-class SensorOptics(Protocol):
-    """Optics of a wavefront sensor: from optical path in metres to relative intensity."""
-
-    def frame(
-        self, opd_m: NDArray[np.float32], image: NDArray[np.float32] | None = None
-    ) -> NDArray[np.float32]:
-        """Add the intensity to ``image`` and return it."""
-
-
-@runtime_checkable
-class ModulatedOptics(SensorOptics, Protocol):
-    """Optics of a pyramid, whose modulation path may be set between frames."""
-
-    modulation: ModulationPath
 
 
 def make_sensor_optics(config: SystemConfig, pupil: PupilGeometry) -> SensorOptics:
@@ -44,7 +29,7 @@ def make_sensor_optics(config: SystemConfig, pupil: PupilGeometry) -> SensorOpti
 
 def make_pyramid(
     config: SystemConfig, sensor: PyramidSection, pupil: PupilGeometry, amplitude: NDArray[np.float32]
-) -> PyramidOptics | OOPAOPyramid:
+) -> ModulatedOptics:
     """Build a pyramid without modulation, with its images at their true positions."""
     optics_class: type[PyramidOptics | OOPAOPyramid] = PyramidOptics
     if config.system.optics == "oopao":
