@@ -186,7 +186,7 @@ def test_matrices_equal_those_of_oopao(variety):
     for registration, width in ((Registration(), 1.0), (PLANTED, 1.1)):
         ours, theirs = (
             module(config, None).zonal_matrix(registration, width)
-            for module in (make_fast_model, oopao_model.make_model)
+            for module in (make_fast_model, oopao_model.make_oopao_model)
         )
         assert ours.shape == theirs.shape
         assert np.linalg.norm(ours - theirs) < 2e-5 * np.linalg.norm(theirs)
@@ -338,7 +338,7 @@ def test_found_images_count_and_not_the_design():
     assert np.linalg.norm(one - two) > 1e-3 * np.linalg.norm(one)
 
 
-@pytest.mark.parametrize("make", [make_fast_model, oopao_model.make_model])
+@pytest.mark.parametrize("make", [make_fast_model, oopao_model.make_oopao_model])
 def test_pupils_of_another_size_are_refused(make):
     config = configuration()
     pupils = nominal_pupils(config)

@@ -83,7 +83,7 @@ def _matrix(config: SystemConfig, peer: str) -> BenchmarkRow:
     start = time.perf_counter()
     ours = make_fast_model(config, None)
     built_s = time.perf_counter() - start
-    theirs = oopao_model.make_model(config, None)
+    theirs = oopao_model.make_oopao_model(config, None)
     at = Registration(62.0, -138.0, 0.9, -1.7, 0.8)
     a, b = ours.zonal_matrix(at), theirs.zonal_matrix(at)
     agreement = float(np.linalg.norm(a - b) / np.linalg.norm(b))

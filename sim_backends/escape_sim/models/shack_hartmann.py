@@ -18,8 +18,8 @@ from escape_hw.api.registration import Registration
 from escape_hw.api.sensor import SubApertureGrid
 from escape_hw.config.sensor import ShackHartmannSection
 from escape_hw.pipeline.slopes.shack_hartmann import subaperture_windows
-from escape_sim.mirror.influence_functions import InfluenceFunctions, nominal_influence_functions
-from escape_sim.mirror.mode_surfaces import N_DERIVATIVES, GaussianFactors, gaussian_factors, mode_surfaces
+from escape_sim.mirror.mode_surfaces import N_DERIVATIVES, GaussianFactors, mode_surfaces
+from escape_sim.models.base import DesignModel
 from escape_sim.optics.pupil import PupilGeometry, nominal_flux, pupil_geometry
 from escape_sim.optics.shack_hartmann import field_pixels, first_pixels, lenslet_transform
 
@@ -57,15 +57,6 @@ def slope_weights(
     relative to the pixels. It is also averaged over the turbulence within a lenslet
     (:func:`lenslet_turbulence`), which lifts the wings of the spots above the threshold; without it
     scalings would be underestimated.
-
-    Parameters
-    ----------
-    config
-        Design of sensor, camera and beam.
-    grid
-        The grid measured on the camera.
-    pupil
-        The sampled pupil.
 
     Returns
     -------
@@ -391,7 +382,7 @@ def nominal_grid(config: SystemConfig) -> SubApertureGrid:
     return SubApertureGrid(pitch, origin, valid, references, flux.astype(np.float32), 0.0)
 
 
-class ShackHartmannModel:
+class ShackHartmannModel(DesignModel):
     """Small-signal slopes of a diffractive Shack-Hartmann sensor with a mirror of Gaussian actuators.
 
     The centre of gravity of a spot is a smooth function of the phase on its lenslet. Its derivative is
@@ -399,10 +390,8 @@ class ShackHartmannModel:
 
     Parameters
     ----------
-    config
-        The design: sensor, mirror and beam. Its ``twin`` section is not read.
-    grid
-        The grid measured on the camera.
+    config, grid
+        The design, and the grid measured on the camera.
 
     Raises
     ------
@@ -413,28 +402,17 @@ class ShackHartmannModel:
     name = "fast"
 
     def __init__(self, config: SystemConfig, grid: SubApertureGrid) -> None:
-        self._pupil = pupil_geometry(config)
+        super().__init__(config, pupil_geometry(config))
         if grid.valid.shape != (self._pupil.n_sub, self._pupil.n_sub):
             raise ValueError(
                 f"the grid has {grid.valid.shape} lenslets, "
                 f"the design {self._pupil.n_sub} x {self._pupil.n_sub}"
             )
-        self._nominal = nominal_influence_functions(config)
         self._opd_per_command_m = 2 * config.devices.dm.stroke_m
-        self._config, self._grid = config, grid
+        self._grid = grid
         self._variants: list[ShackHartmannModel] | None = None
         weights = slope_weights(config, grid, self._pupil)
         self._slopes = SlopeOperator(weights, grid.valid, self._pupil.sub_aperture_m)
-
-    @property
-    def n_act(self) -> int:
-        """Number of actuators."""
-        return self._nominal.n_act
-
-    @property
-    def sub_aperture_m(self) -> float:
-        """Size of a sub-aperture on the pupil in metres."""
-        return self._pupil.sub_aperture_m
 
     def influence_functions(self) -> tuple[NDArray[np.float64], NDArray[np.bool_], float]:
         """Nominal influence functions for the modal basis, see :class:`SyntheticModel`."""
@@ -444,28 +422,24 @@ class ShackHartmannModel:
             self._pupil.coordinates_m.reshape(-1, 2).mean(axis=1), self._pupil.amplitude[::2, ::2],
         )  # fmt: skip
         x = pupil.coordinates_m
-        surfaces = self._influence(1.0).surfaces(Registration(), self.sub_aperture_m, x, x)
         r2 = x[:, None] ** 2 + x[None, :] ** 2
         radius = self._pupil.n_sub * self._pupil.sub_aperture_m / 2
-        return surfaces, r2 <= radius**2, pupil.pixel_m
+        return self._surfaces(x), r2 <= radius**2, pupil.pixel_m
 
     def zonal_matrix(self, registration: Registration, width: float = 1.0) -> NDArray[np.float64]:
         """Slopes in pixels per unit command ``(n_slopes, n_act)``, see :class:`SyntheticModel`."""
         if registration.anamorphosis_angle:
             # An inclined elliptic Gaussian is not separable in x and y.
-            at = self._slopes.nodes_m
-            surfaces = self._influence(width).surfaces(registration, self.sub_aperture_m, at, at)
-            return np.asarray(
-                self._slopes.slopes(np.moveaxis(surfaces, 0, 2).copy()) * self._opd_per_command_m
-            )
-        factors = self._factors(registration, width, np.float64)
+            surfaces = np.moveaxis(self._surfaces(self._slopes.nodes_m, registration, width), 0, 2).copy()
+            return np.asarray(self._slopes.slopes(surfaces) * self._opd_per_command_m)
+        factors = self._factors(self._slopes.nodes_m, registration, width, np.float64)
         return np.asarray(self._slopes.zonal(factors)[0] * self._opd_per_command_m)
 
     def zonal_jacobian(
         self, registration: Registration, width: float = 1.0
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Zonal matrix and its derivatives, see :class:`DifferentiableModel`; single precision."""
-        factors = self._factors(registration, width, np.float32)
+        factors = self._factors(self._slopes.nodes_m, registration, width)
         parts = self._slopes.zonal(factors, derivatives=True) * np.float32(self._opd_per_command_m)
         out = np.empty((N_DERIVATIVES, *parts.shape[1:]))
         for p, ((along_x, along_y), (width_x, width_y)) in enumerate(
@@ -482,7 +456,7 @@ class ShackHartmannModel:
         self, registration: Registration, m2c: NDArray[np.float64], width: float = 1.0
     ) -> NDArray[np.float64]:
         """Slopes per unit mode ``(n_slopes, n_modes)``, see :class:`DifferentiableModel`."""
-        factors = self._factors(registration, width, np.float32)
+        factors = self._factors(self._slopes.nodes_m, registration, width)
         if m2c.shape[1] <= _MAX_DIRECT_MODES:
             return np.asarray(
                 self._slopes.slopes(mode_surfaces(factors, m2c)) * self._opd_per_command_m, dtype=float
@@ -493,7 +467,7 @@ class ShackHartmannModel:
         self, registration: Registration, m2c: NDArray[np.float64], width: float = 1.0
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Modal matrix and its derivatives, see :class:`DifferentiableModel`; single precision."""
-        factors = self._factors(registration, width, np.float32)
+        factors = self._factors(self._slopes.nodes_m, registration, width)
         parts = self._slopes.zonal(factors, derivatives=True)
         modes = (m2c * self._opd_per_command_m).astype(np.float32)
         out = np.zeros((N_DERIVATIVES, parts.shape[1], m2c.shape[1]))
@@ -513,10 +487,3 @@ class ShackHartmannModel:
             grid = replace(self._grid, motion_px=self._grid.motion_px * (1 + _MOTION_UNCERTAINTY))
             self._variants = [ShackHartmannModel(self._config, grid)] if grid.motion_px else []
         return list(self._variants)
-
-    def _factors(self, registration: Registration, width: float, dtype: DTypeLike) -> GaussianFactors:
-        at = self._slopes.nodes_m
-        return gaussian_factors(self._influence(width), registration, self.sub_aperture_m, at, at, dtype)
-
-    def _influence(self, width: float) -> InfluenceFunctions:
-        return replace(self._nominal, width=width)

@@ -98,11 +98,13 @@ class SourceAndTelescope:
     telescope: Any
     photons_per_unit: float
 
-    def propagate(self, opd_m: NDArray[np.floating], sensor: Any) -> None:
-        """Propagate the light with an optical path ``(n, n)`` in metres to a sensor."""
+    def propagate(self, path: Any, sensor: Any) -> None:
+        """Propagate the light to a sensor by OOPAO's mirror or an optical path ``(n, n)`` in metres."""
         with suppress_output():
+            if isinstance(path, np.ndarray):
+                path = oopao_classes().OPD_map(path.astype(float))
             # '**' starts a new propagation; '*' would add to the last one.
-            self.source**self.telescope * oopao_classes().OPD_map(np.asarray(opd_m, dtype=float)) * sensor
+            self.source**self.telescope * path * sensor
 
 
 def make_source(amplitude: NDArray[np.float32], diameter_m: float, wavelength_m: float) -> SourceAndTelescope:
