@@ -13,7 +13,6 @@ from escape_hw.api.registration import Registration
 from escape_hw.api.sensor import SensorGeometry, SubApertureGrid
 from escape_hw.api.synthetic_model import SyntheticModel
 from escape_hw.config.sensor import ShackHartmannSection
-from escape_hw.deprecation import renamed_attributes
 from escape_hw.errors import CalibrationError
 from escape_hw.pipeline.slopes.pyramid import slopes_of_image
 from escape_sim.models.base import DesignModel
@@ -214,4 +213,5 @@ def make_oopao_model(config: SystemConfig, grid: SensorGeometry | None) -> Synth
     return OOPAOShackHartmannModel(config, geometry)
 
 
-__getattr__ = renamed_attributes(__name__, {"make_model": "make_oopao_model"})
+#: Name of the entry point in the metadata of editable installations made before it was renamed.
+make_model = make_oopao_model
