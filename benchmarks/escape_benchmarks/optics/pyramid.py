@@ -125,7 +125,7 @@ def _kernel(case: _Case, peer: str) -> BenchmarkRow:
     ours_s, peer_s = time_alternately(lambda: fast.frame(path), theirs, seconds=2.0, rounds=5)
     floor_s, what = _arithmetic_floor(n, case.grid * case.samples, fast)
     note = (
-        f"{n} samples on {case.grid * case.samples}, {fast.modulation.n_points} points; "
+        f"{n} samples on {case.grid * case.samples}, {len(fast.modulation.points)} points; "
         f"relative difference {agreement:.0e}; {what} alone take {floor_s / ours_s:.0%} of the time"
     )
     return _rate(f"optics: pyramid, {case.name}", ours_s, peer_s, f"{peer} Pyramid", note)
@@ -137,7 +137,7 @@ def _rate(stage: str, ours_s: float, peer_s: float | None, peer: str, note: str)
 
 def _arithmetic_floor(n: int, size: int, optics: PyramidOptics) -> tuple[float, str]:
     """Seconds that nothing but the arithmetic of a frame takes, and what that is."""
-    if optics.method == "separable":
+    if optics.uses_matrix_products:
         h = n // 2
         once_s = 0.0
         for left, right in (((2, n, h), (2, h, size // 2)), ((2, size // 2, h), (2, h, size))):
@@ -149,4 +149,4 @@ def _arithmetic_floor(n: int, size: int, optics: PyramidOptics) -> tuple[float, 
         plan = pyfftw.FFTW(source, out, axes=(1,), flags=("FFTW_ESTIMATE",))
         once_s = time_alternately(plan.execute, None, seconds=0.3)[0] * (n + 3 * size) / size
         what = "transforms"
-    return once_s * optics.modulation.n_points / WORKERS, what
+    return once_s * len(optics.modulation.points) / WORKERS, what

@@ -39,19 +39,8 @@ def trigonometric_interpolation(at: NDArray[np.float64], period: int) -> NDArray
 def camera_pixel_matrix(offset_px: NDArray[np.float64], n_pix: int, spot_px: float) -> NDArray[np.float64]:
     """Matrix from OOPAO's samples of a lenslet's image to camera pixels, along one axis.
 
-    Parameters
-    ----------
-    offset_px
-        Pixels relative to the lenslet's centre, any shape.
-    n_pix
-        Pupil samples across a lenslet.
-    spot_px
-        lambda/d in camera pixels.
-
-    Returns
-    -------
-    ndarray, ``(*offset_px.shape, SAMPLING * n_pix)``
-        Normalised so that a whole field contains the light of the lenslet.
+    ``offset_px`` are pixels relative to the lenslet's centre. The matrix ``(*offset_px.shape, SAMPLING *
+    n_pix)`` is normalised so that a whole field contains the light of the lenslet.
     """
     period = SAMPLING * n_pix
     at = (period - 1) / 2 + offset_px * SAMPLING / spot_px
@@ -60,18 +49,12 @@ def camera_pixel_matrix(offset_px: NDArray[np.float64], n_pix: int, spot_px: flo
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WindowMoments:
-    """Weights of OOPAO's samples of one lenslet in each window's sums.
+    """Weights of OOPAO's samples of one lenslet in each window's sums."""
 
-    Parameters
-    ----------
-    lenslet
-        Index of the lenslet among the lit ones ``(n_valid,)``; arbitrary where the weights are 0.
-    along_x, along_y
-        Weights for the window's sum and its first moment about its own lenslet's centre,
-        ``(n_valid, samples, 2)``.
-    """
-
+    #: Index of the lenslet among the lit ones ``(n_valid,)``; arbitrary where the weights are 0.
     lenslet: NDArray[np.intp]
+    #: Weights ``(n_valid, samples, 2)`` for the window's sum and its first moment about its own lenslet's
+    #: centre, along either axis.
     along_x: NDArray[np.float64]
     along_y: NDArray[np.float64]
 
@@ -81,16 +64,8 @@ def window_moments(
 ) -> list[WindowMoments]:
     """Weights of every valid window for its own lenslet and the eight around it.
 
-    Parameters
-    ----------
-    grid
-        The sub-aperture grid.
-    lit
-        Lit lenslets ``(n_sub, n_sub)``, in whose order OOPAO returns images.
-    shape
-        Camera region (rows, columns).
-    n_pix, spot_px
-        Pupil samples across a lenslet, and lambda/d in camera pixels.
+    ``lit (n_sub, n_sub)`` are the lit lenslets, in whose order OOPAO returns images; other parameters as for
+    :class:`LensletOptics`.
     """
     n_sub = lit.shape[0]
     number = np.where(lit, np.cumsum(lit).reshape(lit.shape) - 1, -1)
@@ -238,7 +213,7 @@ class OOPAOPyramid(ModulatedOptics):
         with suppress_output():
             self.sensor.user_modulation_path = tilts.tolist()
             # OOPAO divides by the number of points in the field and again in the weighted sum.
-            self.sensor.weight_vector = modulation.weights * len(tilts) ** 2
+            self.sensor.weight_vector = np.full(len(tilts), modulation.weight * len(tilts) ** 2)
             self.sensor.modulation = float(np.hypot(*tilts.T).max())
 
     def _add_intensity(self, opd_m: NDArray[np.floating], out: NDArray[np.floating]) -> None:

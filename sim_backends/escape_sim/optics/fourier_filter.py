@@ -49,10 +49,8 @@ class FourierFilter:
     ----------
     transmission
         Factor ``(size, size)`` for each frequency, rows along y, in the order of a transform.
-    n
-        Side of the field.
-    rows
-        Number of output rows wanted, from row 0 on.
+    n, rows
+        Side of the field, and number of output rows wanted, from row 0 on.
 
     Attributes
     ----------

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from numba import njit
@@ -257,8 +256,6 @@ class SeparableKernel:
 #: Threads that share the modulation points of a frame; fixed, so that rounding is the same everywhere.
 WORKERS = 2
 
-Method = Literal["auto", "separable", "fourier"]
-
 
 class PyramidOptics(ModulatedOptics):
     """Pyramid sensor: four images of the pupil on one camera.
@@ -275,24 +272,17 @@ class PyramidOptics(ModulatedOptics):
         Pupil amplitude ``(n, n)``, ``n`` even.
     diameter_px
         Diameter of a pupil image in camera pixels, which defines lambda/D.
-    wavelength_m
-        Wavelength in metres.
     centres_px
         Centres ``(4, 2)`` as (x, y) of the pupil images on the region in camera pixels: upper left,
         upper right, lower left, lower right.
     shape
         Camera region (rows, columns). Light outside it is lost.
-    modulation
-        Path of the image over the pyramid.
     rooftop
         Length of the ridge in place of the apex in lambda/D; negative for the other diagonal.
     samples
         Pupil samples across a camera pixel.
     grid_px
         Side of the periodic grid in camera pixels; by default the next fast length for the region.
-    method
-        ``separable`` (matrix products, for images on a rectangle only) or ``fourier``; the faster one
-        by default. Both give the same frames in single precision.
 
     Raises
     ------
@@ -312,7 +302,6 @@ class PyramidOptics(ModulatedOptics):
         rooftop: float = 0.0,
         samples: int = 1,
         grid_px: int | None = None,
-        method: Method = "auto",
     ) -> None:
         n = amplitude.shape[0]
         if amplitude.shape != (n, n) or n % 2:
@@ -328,7 +317,7 @@ class PyramidOptics(ModulatedOptics):
             )
         self._region_on_camera = GridRegion(np.asarray(centres_px, dtype=float), shape, grid, samples)
         self.prism = Prism(self._region_on_camera.shifts(n), self._diameter, rooftop)
-        self._kernels = self._make_kernels(n, grid * samples, method)
+        self._kernels = self._make_kernels(n, grid * samples)
         self._field = np.empty((n, n), np.complex64)
         self._power = np.empty((WORKERS, *self._kernels[0].shape), np.float32)
         self._executor = ThreadPoolExecutor(WORKERS - 1, "pyramid") if helper_threads_allowed() else None
@@ -338,13 +327,13 @@ class PyramidOptics(ModulatedOptics):
         kernel = self._kernels[0]
         tilts_per_sample = modulation.points / self._diameter
         x, y = kernel.tilts(tilts_per_sample[:, 0]), kernel.tilts(tilts_per_sample[:, 1])
-        y *= np.sqrt(modulation.weights).astype(np.float32)[:, None]
+        y *= np.float32(np.sqrt(modulation.weight))
         self._tilts = [(x[k::WORKERS], y[k::WORKERS]) for k in range(WORKERS)]
 
     @property
-    def method(self) -> Method:
-        """Method in use, ``separable`` or ``fourier``."""
-        return "separable" if isinstance(self._kernels[0], SeparableKernel) else "fourier"
+    def uses_matrix_products(self) -> bool:
+        """Whether the light is propagated by matrix products instead of Fourier transforms."""
+        return isinstance(self._kernels[0], SeparableKernel)
 
     def _add_intensity(self, opd_m: NDArray[np.floating], out: NDArray[np.floating]) -> None:
         opd = np.ascontiguousarray(opd_m, dtype=np.float32)
@@ -367,18 +356,11 @@ class PyramidOptics(ModulatedOptics):
         power.fill(0)
         self._kernels[worker].add(self._field, *self._tilts[worker], power)
 
-    def _make_kernels(self, n: int, n_grid: int, method: Method) -> list[SeparableKernel | FourierKernel]:
+    def _make_kernels(self, n: int, n_grid: int) -> list[SeparableKernel] | list[FourierKernel]:
         half_distances = self.prism.half_distances((n_grid - n) / 2)
-        if method == "separable" and half_distances is None:
-            raise ValueError(
-                "the images are not on a rectangle around the grid's centre; use method 'fourier'"
-            )
-        if half_distances is not None and (
-            method == "separable" or (method == "auto" and _matrix_product_is_faster(n, n_grid))
-        ):
+        if half_distances is not None and _matrix_product_is_faster(n, n_grid):
             return [SeparableKernel(*half_distances, n, n_grid) for _ in range(WORKERS)]
-        rows = self._region_on_camera.rows
-        return [FourierKernel(self.prism, n, n_grid, rows) for _ in range(WORKERS)]
+        return [FourierKernel(self.prism, n, n_grid, self._region_on_camera.rows) for _ in range(WORKERS)]
 
 
 class GridRegion:

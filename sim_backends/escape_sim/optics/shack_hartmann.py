@@ -95,8 +95,6 @@ class LensletOptics(SensorOptics):
     ----------
     n_sub, n_pix
         Lenslets across the grid, and pupil samples across a lenslet.
-    wavelength_m
-        Wavelength in metres.
     pitch_px, spot_px
         Lenslet pitch and lambda/d in camera pixels.
     origin_px
