@@ -79,8 +79,8 @@ class PyramidModel(DesignModel):
 
     Parameters
     ----------
-    config, pupils
-        The design, and the pupil images measured on the camera.
+    pupils
+        The pupil images measured on the camera.
     modulation
         Path of the image over the pyramid; by default a circle of the pupils' modulation radius.
     turbulence
@@ -195,34 +195,38 @@ class PyramidModel(DesignModel):
         if position not in self._shifted_models:
             shift_px = np.array(position) / 100 * self._pupils.diameter_px / self._pupil.n_sub
             pupils = replace(self._pupils, centres_px=self._pupils.centres_px + shift_px)
-            self._shifted_models[position] = self._variant_with(self._modulation, self.turbulence, pupils)
+            self._shifted_models[position] = self._variant(pupils=pupils)
         return self._shifted_models[position]
 
     def variants(self) -> list[PyramidModel]:
         """Models with stronger turbulence, elliptic modulation, or displaced images."""
         if self._variants is None:
-            radius = self._pupils.modulation
-            self._variants = []
+            changes: list[PyramidModel] = []
             if self.turbulence:
-                stronger = self.turbulence * (1 + _STRENGTH_UNCERTAINTY)
-                self._variants.append(self._variant_with(self._modulation, stronger))
+                changes.append(self._variant(turbulence=self.turbulence * (1 + _STRENGTH_UNCERTAINTY)))
+            radius = self._pupils.modulation
             for angle in (0.0, np.pi / 4) if radius else ():
                 elliptic = ModulationPath.circle(radius, ellipse=_ELLIPSE, ellipse_angle=angle)
-                self._variants.append(self._variant_with(elliptic, self.turbulence))
+                changes.append(self._variant(modulation=elliptic))
             for axis in range(2):
                 centres = self._pupils.centres_px.copy()
                 centres[:, axis] += _IMAGE_POSITION_ERROR_PX * _DIAGONALS
-                displaced = replace(self._pupils, centres_px=centres)
-                self._variants.append(self._variant_with(self._modulation, self.turbulence, displaced))
+                changes.append(self._variant(pupils=replace(self._pupils, centres_px=centres)))
+            self._variants = changes
         return list(self._variants)
 
     # ------------------------------------------------------------------ construction
-    def _variant_with(
-        self, modulation: ModulationPath, turbulence: float, pupils: PyramidPupils | None = None
+    def _variant(
+        self,
+        *,
+        pupils: PyramidPupils | None = None,
+        modulation: ModulationPath | None = None,
+        turbulence: float | None = None,
     ) -> PyramidModel:
+        """The same model, except for what is given."""
         return PyramidModel(
-            self._config, pupils or self._pupils, modulation=modulation, turbulence=turbulence,
-            basis=self._modes,
+            self._config, pupils or self._pupils, modulation=modulation or self._modulation,
+            turbulence=self.turbulence if turbulence is None else turbulence, basis=self._modes,
         )  # fmt: skip
 
     def _turbulence_uncertainty(self) -> NDArray[np.float64]:

@@ -111,11 +111,6 @@ def lenslet_turbulence(samples: int) -> NDArray[np.float64]:
     return np.concatenate([first, first[::-1, ::-1, ::-1]])
 
 
-def _orientations(phase: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The eight orientations ``(8, p, p)`` of a square wavefront ``(p, p)``."""
-    return np.stack([np.rot90(p, turns) for p in (phase, phase.T) for turns in range(_N_ORIENTATIONS // 2)])
-
-
 def _turbulence_strength(config: SystemConfig, grid: SubApertureGrid) -> float:
     """``(d / r0)^(5/3)`` of the turbulence on a lenslet, from the spot motion that it causes."""
     sensor = config.sensor_as(ShackHartmannSection)
@@ -196,7 +191,8 @@ class _WindowImages:
         Every window rotates the shift, and orients the blurring ``phase``, in its own way.
         """
         (cosine, sine), (along, across) = self._axes, shift
-        blur = np.exp(1j * _orientations(phase)).astype(self._complex)[self._orientation]
+        oriented = np.stack([np.rot90(p, turns) for p in (phase, phase.T) for turns in range(4)])
+        blur = np.exp(1j * oriented).astype(self._complex)[self._orientation]
         tilt = [
             np.exp(2j * np.pi * d[:, None] * self._samples / self._spot).astype(self._complex).conj()
             for d in (sine * along + cosine * across, cosine * along - sine * across)
@@ -248,14 +244,7 @@ class SlopeOperator:
     A window receives light of its own lenslet and the eight around it, so each slope is a weighted sum
     over ``3 x 3`` lenslets of ``NODES x NODES`` nodes.
 
-    Parameters
-    ----------
-    weights
-        From :func:`slope_weights`: slopes per unit of surface on each pupil sample.
-    valid
-        Lenslets with a window ``(n_sub, n_sub)``.
-    sub_aperture_m
-        Size of a sub-aperture in metres.
+    ``weights`` are those of :func:`slope_weights`, ``valid (n_sub, n_sub)`` the lenslets with a window.
     """
 
     def __init__(
@@ -271,20 +260,14 @@ class SlopeOperator:
         k = nodes.size
         table = np.zeros((rows.size, 2, _LENSLETS_ACROSS, k, _LENSLETS_ACROSS, k))
         for (down, right), block in weights.items():
-            table[:, :, down + 1, :, right + 1, :] = (interpolation.T @ block @ interpolation).transpose(
-                1, 0, 2, 3
-            )
+            at_nodes = interpolation.T @ block @ interpolation
+            table[:, :, down + 1, :, right + 1, :] = at_nodes.transpose(1, 0, 2, 3)
         self._table = table.reshape(rows.size, 2, _LENSLETS_ACROSS * k, _LENSLETS_ACROSS * k)
         # Lenslets beyond the edge have nodes with zero weights.
         lattice = np.arange(-1, n_sub + 1) - (n_sub - 1) / 2
         self.nodes_m = ((lattice[:, None] + nodes) * sub_aperture_m).ravel()
         self._first_y, self._first_x = (rows * k).astype(np.int64), (columns * k).astype(np.int64)
         self._tables_by_dtype: dict[str, NDArray[np.floating]] = {}
-
-    @property
-    def n_slopes(self) -> int:
-        """Number of slopes, all x and then all y."""
-        return 2 * len(self._table)
 
     def slopes(self, surfaces: NDArray[np.floating]) -> NDArray[np.floating]:
         """Slopes ``(n_slopes, n)`` of surfaces ``(n_nodes, n_nodes, n)`` at the nodes.
@@ -293,7 +276,7 @@ class SlopeOperator:
         """
         out = np.zeros((2, len(self._table), surfaces.shape[2]), surfaces.dtype)
         _apply_to_surfaces(self._weights(surfaces.dtype), self._first_y, self._first_x, surfaces, out)
-        return out.reshape(self.n_slopes, -1)
+        return out.reshape(2 * len(self._table), -1)
 
     def zonal(self, factors: GaussianFactors, *, derivatives: bool = False) -> NDArray[np.floating]:
         """Slopes of all influence functions ``(n, n_slopes, n_act)``, from their separable factors.
@@ -306,7 +289,7 @@ class SlopeOperator:
         side = np.ascontiguousarray(x[:kinds].transpose(1, 0, 2)).reshape(x.shape[1], -1)
         out = np.zeros((5 if derivatives else 1, 2, len(self._table), x.shape[2]), x.dtype)
         _apply_to_factors(self._weights(x.dtype), self._first_y, self._first_x, side, y, out)
-        return out.reshape(len(out), self.n_slopes, -1)
+        return out.reshape(len(out), 2 * len(self._table), -1)
 
     def _weights(self, dtype: DTypeLike) -> NDArray[np.floating]:
         kind = np.dtype(dtype).str
@@ -387,11 +370,7 @@ class ShackHartmannModel(DesignModel):
 
     The centre of gravity of a spot is a smooth function of the phase on its lenslet. Its derivative is
     a fixed weight map per lenslet, so a matrix needs one small product per sub-aperture and no frames.
-
-    Parameters
-    ----------
-    config, grid
-        The design, and the grid measured on the camera.
+    ``grid`` is the one measured on the camera.
 
     Raises
     ------

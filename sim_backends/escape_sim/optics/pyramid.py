@@ -27,24 +27,18 @@ class Prism:
     face. The surface is the highest of the four planes everywhere, as in OOPAO's
     ``Pyramid.get_phase_mask``, so faces of unequal tilt meet along edges that are not quite square.
 
-    Parameters
-    ----------
-    shifts
-        Shift ``(4, 2)`` as (x, y) of each image in pupil samples: upper left, upper right, lower
-        left, lower right.
-    diameter
-        Pupil diameter in samples.
-    rooftop
-        Length in lambda/D of the ridge that replaces the apex; negative for the other diagonal.
-
     Raises
     ------
     ValueError
-        The shifts are not four finite points in this order.
+        The shifts are not four finite points in their order.
     """
 
+    #: Shift ``(4, 2)`` as (x, y) of each image in pupil samples: upper left, upper right, lower left, lower
+    #: right.
     shifts: NDArray[np.float64]
+    #: Pupil diameter in samples.
     diameter: float
+    #: Length in lambda/D of the ridge that replaces the apex; negative for the other diagonal.
     rooftop: float = 0.0
 
     def __post_init__(self) -> None:
