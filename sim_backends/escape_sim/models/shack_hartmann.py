@@ -161,13 +161,10 @@ class _WindowImages:
             exists = (i >= 0) & (i < n) & (j >= 0) & (j < n)
             i, j = np.clip(i, 0, n - 1), np.clip(j, 0, n - 1)
             self._blocks[step] = (blocks[i, j] * exists[:, None, None]).astype(self._real)
-            self._along[step] = tuple(
-                self._transform(first + (np.arange(n) + by) * pitch, at, p, field)[number]
-                for first, pitch, by, at, number in (
-                    (y_first, y_pitch, step[0], row_at, rows),
-                    (x_first, x_pitch, step[1], column_at, columns),
-                )
-            )
+            y, x = y_first + (np.arange(n) + step[0]) * y_pitch, x_first + (np.arange(n) + step[1]) * x_pitch
+            self._along[step] = (
+                self._transform(y, row_at, p, field)[rows], self._transform(x, column_at, p, field)[columns],
+            )  # fmt: skip
 
     def _transform(
         self, centre: NDArray[np.floating], at: NDArray[np.intp], p: int, field: int

@@ -54,10 +54,9 @@ class FourierFilter:
 
     Attributes
     ----------
-    field
-        Input: ``[:n, :n]`` of a larger array; the rest must stay zero.
-    result
-        Output: ``[:rows, :size]`` of a larger array, ``size ** 2`` times numpy's inverse transform.
+    field, result
+        Input ``[:n, :n]`` of a larger array, whose rest must stay zero; output ``[:rows, :size]`` of a larger
+        array, ``size ** 2`` times numpy's inverse transform.
     """
 
     def __init__(self, transmission: NDArray[np.complexfloating], n: int, rows: int) -> None:

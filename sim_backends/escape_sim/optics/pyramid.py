@@ -38,7 +38,7 @@ class Prism:
     shifts: NDArray[np.float64]
     #: Pupil diameter in samples.
     diameter: float
-    #: Length in lambda/D of the ridge that replaces the apex; negative for the other diagonal.
+    #: Length in lambda/D of the ridge; negative for the other diagonal.
     rooftop: float = 0.0
 
     def __post_init__(self) -> None:
@@ -272,7 +272,7 @@ class PyramidOptics(ModulatedOptics):
     shape
         Camera region (rows, columns). Light outside it is lost.
     rooftop
-        Length of the ridge in place of the apex in lambda/D; negative for the other diagonal.
+        Length in lambda/D of the ridge that replaces the apex; negative for the other diagonal.
     samples
         Pupil samples across a camera pixel.
     grid_px
