@@ -42,7 +42,7 @@ def run() -> list[BenchmarkRow]:
 
 
 def _matrix(config: SystemConfig, peer: str) -> BenchmarkRow:
-    ours, theirs = make_fast_model(config, None), oopao_model.make_model(config, None)
+    ours, theirs = make_fast_model(config, None), oopao_model.make_oopao_model(config, None)
     at = Registration(-16.0, -71.0, -0.77, 2.9, 0.0)
     a, b = ours.zonal_matrix(at), theirs.zonal_matrix(at)
     agreement = float(np.linalg.norm(a - b) / np.linalg.norm(b))

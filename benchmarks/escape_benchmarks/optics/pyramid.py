@@ -78,7 +78,7 @@ def _matrix(config: SystemConfig, peer: str) -> BenchmarkRow:
     start = time.perf_counter()
     ours = make_fast_model(config, None)
     built_s = time.perf_counter() - start
-    theirs = oopao_model.make_model(config, None)
+    theirs = oopao_model.make_oopao_model(config, None)
     at = Registration(62.0, -138.0, 0.9, -1.7, 0.8)
     a, b = ours.zonal_matrix(at), theirs.zonal_matrix(at)
     agreement = float(np.linalg.norm(a - b) / np.linalg.norm(b))
@@ -114,7 +114,7 @@ def _kernel(case: _Case, peer: str) -> BenchmarkRow:
     times = time_alternately(lambda: fast.frame(path), theirs, seconds=2.0, rounds=5)
     floor_s, what = _arithmetic_floor(n, case.grid * case.samples, fast)
     note = (
-        f"{n} samples on {case.grid * case.samples}, {fast.modulation.n_points} points; "
+        f"{n} samples on {case.grid * case.samples}, {len(fast.modulation.points)} points; "
         f"relative difference {agreement:.0e}; {what} alone take {floor_s / times[0]:.0%} of the time"
     )
     return frame_rate_row(f"optics: pyramid, {case.name}", times, f"{peer} Pyramid", note)
@@ -122,7 +122,7 @@ def _kernel(case: _Case, peer: str) -> BenchmarkRow:
 
 def _arithmetic_floor(n: int, size: int, optics: PyramidOptics) -> tuple[float, str]:
     """Seconds that nothing but the arithmetic of a frame takes, and what that is."""
-    if optics.method == "separable":
+    if optics.uses_matrix_products:
         h = n // 2
         once_s = 0.0
         for left, right in (((2, n, h), (2, h, size // 2)), ((2, size // 2, h), (2, h, size))):
@@ -134,4 +134,4 @@ def _arithmetic_floor(n: int, size: int, optics: PyramidOptics) -> tuple[float, 
         plan = pyfftw.FFTW(source, out, axes=(1,), flags=("FFTW_ESTIMATE",))
         once_s = time_alternately(plan.execute, None, seconds=0.3)[0] * (n + 3 * size) / size
         what = "transforms"
-    return once_s * optics.modulation.n_points / WORKERS, what
+    return once_s * len(optics.modulation.points) / WORKERS, what
