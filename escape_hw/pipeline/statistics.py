@@ -82,15 +82,11 @@ class PairedComparison:
 
     Parameters
     ----------
-    mean, sigma
-        The mean and its standard error.
     low, high
         Confidence interval of the mean, at :data:`CONFIDENCE`.
     equivalence
         Smallest margin x within which A and B are equivalent at :data:`CONFIDENCE` by two one-sided tests
         (Schuirmann 1987): the interval of twice the error probability lies within -x..x.
-    pairs
-        Number of pairs.
     """
 
     mean: float
@@ -122,8 +118,6 @@ def compare_pairs(
     ----------
     first, second
         Values of A and B for the same turbulence ``(n,)``.
-    seed
-        Seed of the resampling.
 
     Raises
     ------
@@ -156,8 +150,6 @@ def describe_comparison(first: str, second: str, comparison: PairedComparison, m
     ----------
     first, second
         Names of A and B.
-    comparison
-        Their comparison.
     margin
         Difference of the Strehl ratio within which they count as equivalent.
     """

@@ -63,12 +63,6 @@ class CommandGuard:
 
     Parameters
     ----------
-    device
-        Device name for error messages.
-    n_act
-        Number of actuators.
-    limits
-        The limits to enforce.
     pairs
         Neighbour pairs ``(n_pairs, 2)``, see :func:`~escape_hw.safety.limits.neighbour_pairs`.
 

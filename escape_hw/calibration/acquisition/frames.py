@@ -34,8 +34,6 @@ class FluxMonitor:
 
     Parameters
     ----------
-    camera_name
-        Name of the camera, for the message.
     grid
         Geometry with the usual flux of each sub-aperture.
     """
@@ -71,8 +69,6 @@ def limit_to_reachable(dm: DeformableMirror, shape: NDArray[np.float64]) -> NDAr
 
     Parameters
     ----------
-    dm
-        The mirror.
     shape
         Command ``(n_act,)``.
     """
@@ -123,8 +119,6 @@ def build_interaction_matrix(
         Bench, sensor geometry and mode-to-command matrix ``(n_act, n_modes)``.
     data, sigma
         Matrix and its standard errors ``(n_slopes, n_modes)``.
-    method, metrics
-        Name of the method, and numbers for the header.
     """
     return InteractionMatrix(
         data.astype(np.float32),

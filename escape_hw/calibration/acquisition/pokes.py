@@ -47,8 +47,6 @@ class RandomPokes:
     ----------
     amplitude
         Limit of the absolute poke of each mode ``(n_modes,)``.
-    rng
-        Random generator.
     """
 
     method: ClassVar[str] = "docrime"
@@ -99,8 +97,6 @@ class PushPullPokes:
     ----------
     amplitude
         Push and pull of each mode ``(n_modes,)``.
-    rng
-        Random generator.
     """
 
     method: ClassVar[str] = "push-pull-fast"

@@ -234,8 +234,6 @@ def build_sensor_setup(
         background is estimated from the darkest pixels.
     mean_frame
         Mean of raw frames in counts ``(rows, columns)``.
-    references
-        As for :func:`find_sensor`.
 
     Raises
     ------
@@ -354,15 +352,6 @@ def ensure_sensor_ready(
     bench: Bench, grid: SensorGeometry | None, references: str = "design"
 ) -> Procedure[tuple[SensorGeometry, NDArray[np.float32] | None]]:
     """Flatten the mirror, prepare the sensor, and find its geometry unless it is given.
-
-    Parameters
-    ----------
-    bench
-        An open bench.
-    grid
-        The geometry, if it is known.
-    references
-        As for :func:`find_sensor`.
 
     Returns
     -------

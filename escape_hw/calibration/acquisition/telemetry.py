@@ -25,10 +25,6 @@ class AlignedTelemetry:
         command and a poke, the poke follows: ``(n_times, n_slopes + 2 n_modes)``.
     present
         ``(n_times,)``, false where the frame was lost.
-    n_slopes
-        Number of columns with slopes.
-    closed
-        Whether the rows are of a closed loop.
     """
 
     rows: NDArray[np.float32]
@@ -76,17 +72,7 @@ class AlignedTelemetry:
 
 
 class AlignedBuffer:
-    """Preallocated rows of :class:`AlignedTelemetry` that are filled, processed and reused.
-
-    Parameters
-    ----------
-    n_slopes, n_modes
-        Number of slopes and of modes.
-    rows
-        Rows of the buffer.
-    closed
-        Whether frames are of a closed loop, with the poke beside the command.
-    """
+    """Preallocated rows of :class:`AlignedTelemetry` that are filled, processed and reused."""
 
     def __init__(self, n_slopes: int, n_modes: int, rows: int, *, closed: bool = False) -> None:
         self.n_slopes, self.closed = n_slopes, closed
@@ -190,8 +176,6 @@ class TelemetryBuffer:
 
     Parameters
     ----------
-    n_slopes, n_modes
-        Number of slopes and of modes.
     rows
         Frames of a block.
     history_rows

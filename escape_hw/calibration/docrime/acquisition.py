@@ -44,8 +44,6 @@ class OpenLoopAcquisition:
 
     Parameters
     ----------
-    bench
-        An open bench, loop open.
     m2c
         Mode-to-command matrix ``(n_act, n_modes)``.
     grid
@@ -56,8 +54,6 @@ class OpenLoopAcquisition:
         Builds the estimator from the number of slopes; ``None``: no estimator.
     store_samples
         Whether to keep slopes and pokes, for :meth:`record`.
-    monitor
-        Checkpoint and stopping criterion of the estimate.
     """
 
     bench: Bench
@@ -91,8 +87,6 @@ class OpenLoopAcquisition:
             Number of frames, including those of a resumed run.
         pokes
             Source of the modal poke of each frame ``(n_modes,)``.
-        stage
-            Name of the stage in progress reports.
 
         Returns
         -------

@@ -47,19 +47,7 @@ _CHECK_INTERVAL = 500
 
 
 class ClosedLoopAcquisition:
-    """A loop with injected pokes, and the estimator beside it.
-
-    Parameters
-    ----------
-    bench
-        An open bench.
-    matrix, grid
-        Matrix that closes the loop, and its geometry.
-    estimator
-        Closed-loop estimator.
-    monitor
-        Checkpoint and stopping criterion of the estimate.
-    """
+    """A loop with injected pokes, and the estimator beside it."""
 
     def __init__(
         self,

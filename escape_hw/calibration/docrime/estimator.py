@@ -40,12 +40,8 @@ class DocrimeEstimator:
 
     Parameters
     ----------
-    n_slopes, n_modes
-        Number of slopes and of modes.
     order
         Number of past frames that predict the turbulence; 0 for the paper's plain estimator.
-    lags
-        Number of lags of the temporal response.
     correlations
         Whether to sum the correlations of the slopes' noise, which the errors of SPRINT need. With many
         slopes this takes as much time as all the rest.

@@ -55,8 +55,6 @@ def require_response(
         Least-squares matrix ``(n_slopes, n_modes)``.
     covariance
         Covariance of the noise of one frame's slopes ``(n_slopes, n_slopes)``.
-    lags
-        Number of lags of the response.
 
     Raises
     ------
@@ -96,8 +94,6 @@ def variance_inflation(
         Pokes through the temporal response ``(n, n_modes)``.
     at
         Time of each row in frames ``(n,)``, increasing.
-    lags
-        Number of lags of the response.
     """
     centred = noise - noise.mean(axis=0)
     factor = 1.0
@@ -122,8 +118,6 @@ class InitialFit:
     ----------
     whitener
         Filter over time ``(order + 1,)``.
-    response
-        Temporal response.
     variance_inflation
         Factor on the variance of an estimate whose noise is not white.
     """
@@ -142,15 +136,6 @@ def create_sums(n_slopes: int, n_modes: int, closed: bool, *, correlations: bool
 
 def fit_first_frames(data: AlignedTelemetry, order: int, lags: int) -> InitialFit | None:
     """Estimate temporal response and whitening filter, first from frame differences, then iteratively.
-
-    Parameters
-    ----------
-    data
-        Telemetry so far.
-    order
-        Number of past frames that predict the turbulence; 0 for no filter.
-    lags
-        Number of lags of the temporal response.
 
     Returns
     -------
@@ -236,12 +221,8 @@ def estimate_preview(
 
     Parameters
     ----------
-    sums
-        Sums of a running measurement.
     scale
         Factors on the columns ``(n_modes,)`` or ``(1,)``.
-    lags, variance_inflation
-        Number of lags of the temporal response, and factor on the variance.
 
     Returns
     -------
@@ -271,8 +252,6 @@ class DocrimeSolution:
     matrix, sigma
         Slopes per unit mode ``(n_slopes, n_modes)``, and standard errors of its elements, without that of
         their common gain.
-    response
-        Temporal response.
     covariance
         Covariance of one frame's filtered residual slopes ``(n_slopes, n_slopes)``; ``None`` if the
         correlations were not summed.
@@ -283,8 +262,6 @@ class DocrimeSolution:
         Variance of each slope's filtered noise, including the variance inflation ``(n_slopes,)``.
     whitener
         Filter ``(order + 1,)``, ``[1]`` for the plain estimator.
-    frames, lost_frames
-        Number of frames used, and lost by the camera.
     gain_sigma
         Relative standard error of the common gain, by the errors of the temporal response.
     response_covariance
@@ -321,16 +298,8 @@ def solve_sums(
     ----------
     raw_sums
         Sums over all filtered frames; not changed.
-    tracker
-        Temporal response over the same frames.
     whitener
         Filter ``(order + 1,)``. With one weight only, the response is not tested for significance.
-    variance_inflation
-        Factor on the variance of an estimate whose noise is not white.
-    lags
-        Number of lags of the temporal response.
-    frames, lost_frames
-        Number of frames used and lost.
 
     Raises
     ------

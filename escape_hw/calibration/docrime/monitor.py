@@ -22,15 +22,7 @@ StoppingCriterion = Callable[[DocrimeSolution, SensorGeometry], Procedure[bool]]
 
 
 class RunMonitor:
-    """Saves the state of a run when it is time, and evaluates its stopping criterion.
-
-    Parameters
-    ----------
-    checkpoint
-        Where the state is saved; ``None``: it is not saved.
-    criterion
-        Stopping criterion; ``None``: the run goes on to its number of frames.
-    """
+    """Saves the state of a run when it is time, and evaluates its stopping criterion."""
 
     def __init__(self, checkpoint: Checkpoint | None, criterion: StoppingCriterion | None) -> None:
         self._checkpoint, self._criterion, self._next_check = checkpoint, criterion, 0
@@ -54,10 +46,6 @@ class RunMonitor:
 
         Parameters
         ----------
-        estimator, grid
-            Running estimate and sensor geometry.
-        frames
-            Number of frames so far.
         values, arrays
             Entries of the state beside the estimator's own.
         final

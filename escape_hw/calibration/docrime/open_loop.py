@@ -65,13 +65,9 @@ def docrime_run(
     ----------
     bench, frames, poke, whiten, grid, pattern, checkpoint
         As for :func:`docrime`.
-    record
-        Whether to return the telemetry.
     correlations
         Whether to estimate the correlations of the slopes' noise, up to
         :data:`~escape_hw.calibration.docrime.regression.MAX_CORRELATED_SLOPES` slopes.
-    criterion
-        Stopping criterion.
     """
     c = bench.config.calibration
     n_frames = c.frames if frames is None else validate_frame_count(frames)

@@ -100,8 +100,6 @@ class RegressionSums:
         Slopes times slopes of at most :data:`N_SAMPLED_SLOPES` evenly spaced slopes.
     slopes, pokes
         Sums of the slopes ``(n_slopes,)`` and of the pokes ``(n_modes,)``.
-    count
-        Number of frames.
     """
 
     cross: NDArray[np.float64]
@@ -350,8 +348,6 @@ class ForgettingSums(InstrumentalEquations):
 
         Parameters
         ----------
-        template
-            Any matrix of this sensor and basis, for mask, basis and provenance.
         matrix
             The best known matrix ``(n_slopes, n_modes)``, for the controller's part.
 

@@ -66,11 +66,6 @@ class LagSums:
     The products ``z_l y`` and ``z_l x_k`` of each frame are summed, and also the products of these with each
     other. The latter give the covariance of the scores for any weights (White 1980), with errors that are
     correlated between slopes and independent between frames.
-
-    Parameters
-    ----------
-    lags
-        Number of lags.
     """
 
     def __init__(self, lags: int) -> None:
@@ -144,8 +139,6 @@ class FilteredTelemetry:
         beside them.
     now
         Usable rows: their slopes and their commands of all lags are known ``(n,)``, increasing.
-    n_slopes, n_modes
-        Number of columns with slopes, and with commands.
     """
 
     rows: NDArray[np.float32]
@@ -201,8 +194,6 @@ def filter_telemetry(
 
     Parameters
     ----------
-    data
-        Telemetry.
     whitener
         Filter ``(order + 1,)``.
     lags
@@ -246,15 +237,6 @@ def fit_response(data: AlignedTelemetry, whitener: NDArray[np.float64], lags: in
     scales all weights alike, and they are scaled to sum 1. In closed loop the pokes are the instruments of
     the commands, for the matrix and for the weights.
 
-    Parameters
-    ----------
-    data
-        Telemetry with enough rows for a matrix in each half (see :func:`find_usable_rows`).
-    whitener
-        Filter over time ``(order + 1,)``.
-    lags
-        Number of lags.
-
     Returns
     -------
     ResponseEstimate
@@ -278,8 +260,6 @@ def predict_slopes(
 
     Parameters
     ----------
-    data
-        Filtered telemetry.
     matrix
         Matrix whose errors are independent of the noise of these frames ``(n_modes, n_slopes)``.
     power
@@ -317,8 +297,6 @@ class HalfFit:
         Predictions from commands and from pokes for all rows ``(n_rows, n_slopes)``, of any scale.
     now
         Indices of the half's rows among all ``(n,)``.
-    sums
-        Regression of the slopes on the predictions.
     """
 
     slopes: NDArray[np.float32]
@@ -400,12 +378,8 @@ class ResponseTracker:
 
         Parameters
         ----------
-        data
-            The block.
         matrix
             Matrix of the frames before it for the sampled slopes ``(n_few, n_modes)``.
-        power
-            As for :func:`predict_slopes`.
         """
         step, lags = sampling_step(data.n_slopes), self._first.weights.size
         slopes = data.slopes[:, ::step]
@@ -448,15 +422,6 @@ def require_no_late_response(data: AlignedTelemetry, whitener: NDArray[np.float6
     with the wrong size or sign. Its remainder in the slopes is correlated with the pokes of later lags; noise
     is not.
 
-    Parameters
-    ----------
-    data
-        Telemetry.
-    whitener
-        Filter over time ``(order + 1,)``.
-    lags
-        Number of lags of the temporal response.
-
     Raises
     ------
     CalibrationError
@@ -497,11 +462,6 @@ class ResponseAccumulator:
 
     Slopes are regressed on the predictions of a matrix from the commands, with its predictions from the pokes
     as instruments.
-
-    Parameters
-    ----------
-    lags
-        Number of lags.
     """
 
     def __init__(self, lags: int) -> None:
@@ -513,8 +473,6 @@ class ResponseAccumulator:
 
         Parameters
         ----------
-        block
-            Telemetry of a closed loop.
         matrix
             The best known matrix ``(n_slopes, n_modes)``.
         """

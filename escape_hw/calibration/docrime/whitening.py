@@ -28,8 +28,6 @@ def fit_prediction_error_filter(
         ``(n_times, n_slopes)``.
     present
         ``(n_times,)``; rows where it is false are ignored.
-    order
-        Number of past frames.
 
     Returns
     -------
@@ -68,8 +66,6 @@ def apply_filter(
         Filter, latest row first.
     at
         Indices of the rows to return, increasing. All rows between the first and the last are computed.
-    column
-        First column to return.
 
     Returns
     -------
@@ -95,11 +91,6 @@ def fit_history_filters(
     Each is scaled so that its residuals have the variance of those of the longest filter, which gives rows
     with a short past their proper weight. Together they whiten a stretch of any length including its first
     frames, like the Cholesky factor of its covariance over time.
-
-    Parameters
-    ----------
-    residuals, present, order
-        As for :func:`fit_prediction_error_filter`.
     """
     filters, residual_rms = [], []
     history = count_known_history(present, order)

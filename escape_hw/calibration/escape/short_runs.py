@@ -52,14 +52,10 @@ def calibrate_short_run(
 
     Parameters
     ----------
-    bench
-        An open bench, loop open.
     frames
         Number of frames; the geometry of the sensor is found on them as well, unless ``grid`` is given.
     poke
         Pokes are uniform in +-poke on every mode, rms surface as fraction of full stroke.
-    grid
-        Geometry of the sensor, if it is known.
 
     Returns
     -------
@@ -118,12 +114,8 @@ def fit_recorded_frames(
 
     Parameters
     ----------
-    record
-        Frame indices, slopes and pokes.
     template, grid
         A matrix of this sensor and basis, whose data are not used, and the geometry of the model.
-    order
-        Order of the whitening filter.
     """
     c = bench.config.calibration
     data = telemetry_from_frames(*record, before=2 * c.whiten_order + c.lags)

@@ -32,10 +32,6 @@ def build_integrator(
 
     Parameters
     ----------
-    bench
-        Bench whose configuration gives the default loop parameters.
-    matrix, grid
-        Interaction matrix, and the sensor geometry that it was measured on.
     gain, leak, dropped_modes
         Loop parameters; by default as configured.
 
@@ -81,8 +77,6 @@ class LoopChange:
 
     Parameters
     ----------
-    settings
-        The settings.
     control, slopes_of
         Controller, and slope function with the references of the calibration.
     undriven
@@ -99,13 +93,6 @@ class LoopControl:
     """Requests to a running loop, from any thread; the loop applies them between two frames.
 
     The requesting thread does all slow work, such as the inversion of a matrix.
-
-    Parameters
-    ----------
-    bench, calibration
-        Bench, and the calibration whose matrix closes the loop.
-    gain, leak, dropped_modes
-        Loop parameters; by default as configured.
 
     Raises
     ------

@@ -87,12 +87,6 @@ class LoopSummary:
     ----------
     fault
         Why the loop was opened without a request; empty after a request.
-    settings
-        Last settings in force.
-    frames, lost_frames, timeouts
-        Frames processed, frames lost by the camera, and time-outs of the camera.
-    timing
-        Latency and jitter since the loop was closed.
     """
 
     fault: str
@@ -119,10 +113,6 @@ def run_until_opened(
 
     Parameters
     ----------
-    bench
-        An open bench.
-    loop_control
-        Initial matrix and settings, and later requests.
     model_psf
         PSF without turbulence. With it and a science camera the Strehl ratio is measured.
 

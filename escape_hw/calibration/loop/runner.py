@@ -44,13 +44,7 @@ LoopObserver = Callable[[int, NDArray[np.float32], NDArray[np.float64], NDArray[
 
 
 def minimum_strehl_frames(loop_hz: float, science_hz: float) -> int:
-    """Fewest frames of a loop after which its Strehl ratios have standard errors.
-
-    Parameters
-    ----------
-    loop_hz, science_hz
-        Frame rates of the wavefront sensor and of the science camera.
-    """
+    """Fewest frames of a loop after which its Strehl ratios have standard errors."""
     return math.ceil((SETTLING_S + (MIN_SAMPLES + 2) / science_hz) * loop_hz)
 
 
@@ -66,8 +60,6 @@ class LoopRecord:
         Rms of the reconstructed wavefront by frame, in nm.
     latency
         Time from the arrival of a frame to its command by frame, in ns.
-    frames
-        Number of frames processed.
     shortened
         Number of commands that the mirror's limits changed.
     diverged
@@ -98,21 +90,11 @@ class RunningLoop:
         An open bench, its sensor prepared.
     m2c
         Mode-to-command matrix ``(n_act, n_modes)``.
-    slopes_of
-        Slope function.
-    control
-        Modal controller.
-    science
-        Whether to collect frames of the science camera.
 
     Attributes
     ----------
     record
         Measurements of all stretches, also of an aborted one.
-    timing
-        Latencies and frame intervals since construction.
-    settling_frames
-        Number of frames in :data:`SETTLING_S`.
     closed_at_ns
         Time at which the loop was closed, by the clock of the sensor's camera.
     """
@@ -218,14 +200,10 @@ class RunningLoop:
 
         Parameters
         ----------
-        frames
-            Number of frames.
         inject
             Source of pokes. Pokes are added to the controller's command and do not enter its state. With
             pokes, a command beyond the limits is shortened as a whole instead of actuator by actuator, so
             that it remains a known combination of the modes.
-        observe
-            Called after the command of each frame was sent.
         report
             Progress reporter; a stage of its own by default.
 

@@ -179,8 +179,6 @@ def zernike(surfaces: NDArray[np.float64], pupil: NDArray[np.bool_], n_modes: in
         Influence functions ``(n_act, n, n)``.
     pupil
         Boolean ``(n, n)``.
-    n_modes
-        Number of modes.
 
     Raises
     ------
@@ -198,11 +196,6 @@ def zernike(surfaces: NDArray[np.float64], pupil: NDArray[np.bool_], n_modes: in
 
 def fourier(surfaces: NDArray[np.float64], pupil: NDArray[np.bool_], n_modes: int) -> NDArray[np.float64]:
     """Tip, tilt, then cosines and sines of whole cycles across the pupil's diameter, lowest frequency first.
-
-    Parameters
-    ----------
-    surfaces, pupil, n_modes
-        As for :func:`zernike`.
 
     Raises
     ------
@@ -310,8 +303,6 @@ def build_basis(
 
     Parameters
     ----------
-    config
-        Configuration with the section ``basis``.
     surfaces, pupil, pixel_m
         Influence functions ``(n_act, n, n)`` in fractions of full stroke, the pupil ``(n, n)`` and the size
         of a pixel in metres.

@@ -27,10 +27,6 @@ def modal_matrix(
 
     Parameters
     ----------
-    model
-        Any synthetic model.
-    registration
-        Registration of the mirror.
     m2c
         Mode-to-command matrix ``(n_act, n_modes)``.
     width
@@ -46,11 +42,6 @@ def modal_jacobian(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Slopes per unit of each mode, and their derivatives.
 
-    Parameters
-    ----------
-    model, registration, m2c, width
-        As for :func:`modal_matrix`.
-
     Returns
     -------
     matrix : ndarray, ``(n_slopes, n_modes)``
@@ -65,13 +56,7 @@ def modal_jacobian(
 def zonal_jacobian(
     model: SyntheticModel, registration: Registration, width: float = 1.0
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Slopes per unit command ``(n_slopes, n_act)`` and their derivatives ``(6, n_slopes, n_act)``.
-
-    Parameters
-    ----------
-    model, registration, width
-        As for :func:`modal_matrix`.
-    """
+    """Slopes per unit command ``(n_slopes, n_act)`` and their derivatives ``(6, n_slopes, n_act)``."""
     if isinstance(model, DifferentiableModel):
         return model.zonal_jacobian(registration, width)
     return _central_differences(model.zonal_matrix, registration, width)
@@ -87,8 +72,6 @@ def pedestal_jacobian(
 
     Parameters
     ----------
-    model, registration
-        As for :func:`modal_matrix`.
     width
         Scale of the influence functions' width; that of the pedestal is a fixed multiple of it.
     m2c

@@ -41,8 +41,6 @@ class OpticalGainEstimate:
         Temporal response, earlier measurements included.
     common_sigma
         Relative standard error common to all gains, from that of the response.
-    frames, lost_frames
-        Number of frames used and lost.
     """
 
     value: NDArray[np.float64]
@@ -191,14 +189,8 @@ class GainMeasurementLoop:
 
     Parameters
     ----------
-    bench
-        An open bench.
-    calibration
-        The matrix that closes the loop, with its geometry.
     comparisons
         Other matrices of the same geometry and modes whose gains are measured as well.
-    science
-        Whether to accumulate the frames of the science camera.
 
     Raises
     ------
@@ -271,8 +263,6 @@ class GainMeasurementLoop:
             Smallest number of frames.
         amplitude
             Amplitude of the pokes ``(n_modes,)``.
-        stage
-            Name of the stage in progress reports.
         max_frames
             Largest number of frames; ``frames`` by default.
         is_sufficient

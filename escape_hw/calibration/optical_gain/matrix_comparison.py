@@ -113,11 +113,6 @@ def projection(measured: InteractionMatrix, reference: InteractionMatrix) -> Val
 
     ``g_m = r_m^T W d_m / (r_m^T W r_m - sum(w sigma^2))`` with weights from the standard errors.
 
-    Parameters
-    ----------
-    measured, reference
-        As for :func:`deviation_ratio`.
-
     Returns
     -------
     value, sigma : ndarray, ``(n_modes,)``

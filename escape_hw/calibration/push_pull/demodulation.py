@@ -46,10 +46,6 @@ def choose_line_frequencies(n_modes: int, frames: int, band: tuple[float, float]
 
     Parameters
     ----------
-    n_modes
-        Number of modes to drive.
-    frames
-        Frames of the batch.
     band
         Lowest and highest frequency in cycles per frame.
 
@@ -146,8 +142,6 @@ def estimate_delay(lines: SpectralLines, max_delay: float) -> tuple[float, float
 
     Parameters
     ----------
-    lines
-        Output of :func:`fit_lines`.
     max_delay
         Largest delay of the search in frames.
     """

@@ -61,12 +61,6 @@ def propose_exchange(
     ----------
     synthetic, model
         Pseudo-synthetic matrix at the live registration and the live common gain, and its model.
-    live, in_use
-        The live registration, and the matrix in use.
-    dropped
-        Number of eigenmodes that the reconstructor omits.
-    seconds
-        Present time.
     exchange_threshold
         Relative change of the matrix above which an exchange is proposed.
     """

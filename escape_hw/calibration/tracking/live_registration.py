@@ -81,8 +81,6 @@ class LiveEstimate:
         Relative gain of every actuator beyond the common one ``(n_act,)``.
     matrix
         The fitted matrix, random effects included ``(n_slopes, n_modes)``.
-    response
-        Temporal response.
     """
 
     registration: RegistrationEstimate
@@ -119,8 +117,6 @@ class LiveRegistration:
         Seconds between updates.
     n_curve_coefficients
         Coefficients of the curve of optical gains over the modes; 0: one gain for all modes.
-    response
-        Temporal response, if it is known.
     """
 
     def __init__(

@@ -75,14 +75,8 @@ def track(
 
     Parameters
     ----------
-    bench, matrix, grid
-        An open bench, the matrix at the start, and its geometry.
-    seconds
-        Duration.
     registration
         The registration of the matrix; fitted to the matrix by default.
-    response
-        Temporal response, if it is known.
     poke
         Pokes are uniform in +-poke on every mode, rms surface as fraction of full stroke; as configured.
     forgetting_time_s

@@ -127,8 +127,6 @@ def refine_pupil_images(
     means
         Means of equally many frames in counts ``(rows, columns)``, background subtracted, in order of time.
         Their scatter gives the error.
-    pupils
-        Pupil images as found before.
     shadow
         Transmission of the telescope's obscuration and vanes; ``None`` without them.
     """

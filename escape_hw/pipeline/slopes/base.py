@@ -18,8 +18,6 @@ class FrameSlopes(abc.ABC, Generic[G]):
 
     Parameters
     ----------
-    grid
-        The geometry.
     shape
         Region (rows, columns).
     dark

@@ -19,8 +19,6 @@ def slopes_of_image(image: NDArray[Any], pupils: PyramidPupils) -> NDArray[np.fl
     ----------
     image
         Light per pixel ``(rows, columns)``, background subtracted, in any unit.
-    pupils
-        The pupil images and references.
     """
     n = pupils.valid.shape[0]
     ul, ur, ll, lr = (
@@ -83,12 +81,6 @@ class PyramidSlopes(FrameSlopes[PyramidPupils]):
     ----------
     grid
         The pupil images; ``normalisation`` selects the divisor of the differences.
-    shape
-        Region (rows, columns).
-    dark
-        Dark frame in counts, zeros by default.
-    flat
-        Relative pixel response, ones by default.
 
     Raises
     ------

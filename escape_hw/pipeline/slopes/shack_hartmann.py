@@ -124,19 +124,6 @@ def centres_of_gravity(frame, gain, offset, per_pixel, places, weights, zero_poi
 class ShackHartmannSlopes(FrameSlopes[SubApertureGrid]):
     """Slope function of a grid on a camera region.
 
-    Parameters
-    ----------
-    grid
-        The sub-aperture grid.
-    shape
-        Region (rows, columns).
-    dark
-        Dark frame in counts, zeros by default.
-    flat
-        Relative pixel response, ones by default.
-    threshold
-        Level in counts above the dark that is subtracted before the centre of gravity.
-
     Raises
     ------
     ValueError
