@@ -215,20 +215,13 @@ def require_excitation(gram: NDArray[np.floating]) -> None:
 
 
 def estimate_preview(
-    sums: RegressionSums, scale: NDArray[np.float64], lags: int, variance_inflation: float
+    sums: RegressionSums, tracker: ResponseTracker, variance_inflation: float, lags: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
     """Estimate matrix and standard errors ``(n_slopes, n_modes)`` from sums, which are not changed.
 
-    Parameters
-    ----------
-    scale
-        Factors on the columns ``(n_modes,)`` or ``(1,)``.
-
-    Returns
-    -------
-    tuple or None
-        ``None`` if there are too few frames, or the pokes do not span the modes yet.
+    ``None`` if there are too few frames, or the pokes do not span the modes yet.
     """
+    scale = tracker.scale(tracker.response())
     if sums.count < scale.size + lags + MIN_DEGREES_OF_FREEDOM:
         return None
     power = sums.power if sums.power.ndim == 1 else np.diag(sums.power).copy()
@@ -285,8 +278,7 @@ class DocrimeSolution:
 def solve_sums(
     raw_sums: RegressionSums,
     tracker: ResponseTracker,
-    whitener: NDArray[np.float64],
-    variance_inflation: float,
+    fit: InitialFit,
     *,
     lags: int,
     frames: int,
@@ -296,10 +288,10 @@ def solve_sums(
 
     Parameters
     ----------
-    raw_sums
-        Sums over all filtered frames; not changed.
-    whitener
-        Filter ``(order + 1,)``. With one weight only, the response is not tested for significance.
+    raw_sums, tracker
+        Sums and temporal response over all filtered frames; not changed.
+    fit
+        Fit of the first frames. Without a whitening filter the response is not tested for significance.
 
     Raises
     ------
@@ -311,12 +303,12 @@ def solve_sums(
     require_excitation(information)
     matrix = sums.solve()
     dof = sums.degrees_of_freedom() - lags
-    if whitener.size > 1:
+    if fit.whitener.size > 1:
         rows, power = sums.sample(matrix)
         require_response(information, rows, power / dof, lags)
     residual = sums.residual_power(matrix) / dof
     covariance = residual if residual.ndim == 2 else None
-    variance = np.maximum(residual if covariance is None else np.diag(residual), 0.0) * variance_inflation
+    variance = np.maximum(residual if covariance is None else np.diag(residual), 0.0) * fit.variance_inflation
     sigma = np.outer(np.sqrt(variance), np.sqrt(sums.inverse_diagonal()))
     response = tracker.response()
     scale = tracker.scale(response)
@@ -327,7 +319,7 @@ def solve_sums(
         covariance,
         information / np.multiply.outer(scale, scale),
         variance,
-        whitener,
+        fit.whitener,
         frames,
         lost_frames,
         tracker.gain_sigma(response),

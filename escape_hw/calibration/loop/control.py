@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import threading
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,6 +71,10 @@ class LoopSettings:
     leak: float
     dropped_modes: int
 
+    def with_changes(self, **changes: Any) -> LoopSettings:
+        """The settings with changes; those that are ``None`` do not count."""
+        return replace(self, **{name: value for name, value in changes.items() if value is not None})
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoopChange:
@@ -112,12 +117,8 @@ class LoopControl:
         c = bench.config.loop
         self._bench, self._lock = bench, threading.Lock()
         self._open_requested = False
-        self._requested = LoopSettings(
-            calibration,
-            c.gain if gain is None else gain,
-            c.leak if leak is None else leak,
-            c.dropped_modes if dropped_modes is None else dropped_modes,
-        )
+        configured = LoopSettings(calibration, c.gain, c.leak, c.dropped_modes)
+        self._requested = configured.with_changes(gain=gain, leak=leak, dropped_modes=dropped_modes)
         self._pending: LoopChange | None = self._prepare(self._requested)
 
     @property
@@ -150,11 +151,8 @@ class LoopControl:
         """
         with self._lock:
             now = self._requested
-            requested = LoopSettings(
-                now.calibration if calibration is None else calibration,
-                now.gain if gain is None else gain,
-                now.leak if leak is None else leak,
-                now.dropped_modes if dropped_modes is None else dropped_modes,
+            requested = now.with_changes(
+                calibration=calibration, gain=gain, leak=leak, dropped_modes=dropped_modes
             )
             _require_exchangeable(now.calibration, requested.calibration)
             self._pending = self._prepare(requested)

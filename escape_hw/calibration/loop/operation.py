@@ -19,7 +19,7 @@ from escape_hw.api.results import Estimate
 from escape_hw.bench import Bench
 from escape_hw.calibration.acquisition.sensor_setup import prepare_sensor
 from escape_hw.calibration.loop.control import LoopChange, LoopControl, LoopSettings
-from escape_hw.calibration.loop.divergence import DivergenceLimits, ResidualMonitor
+from escape_hw.calibration.loop.divergence import ResidualMonitor
 from escape_hw.calibration.loop.runner import RunningLoop
 from escape_hw.errors import Aborted, CalibrationError, CommandRejected, FrameTimeout
 from escape_hw.pipeline.psf.frame_stack import FrameStack
@@ -155,7 +155,7 @@ class _ContinuousLoop:
         )  # fmt: skip
         rate_hz = bench.wfs.settings.frame_rate_hz
         self.control = first.control
-        self.residual_monitor = ResidualMonitor(DivergenceLimits.from_config(bench.config), rate_hz)
+        self.residual_monitor = ResidualMonitor(bench.config.server, rate_hz)
         self.frames_per_check = max(1, round(_CHECK_PERIOD_S * rate_hz))
         self.fade_frames_left = 0
         self.fade_step = np.zeros(len(first.undriven))

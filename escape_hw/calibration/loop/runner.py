@@ -21,8 +21,8 @@ from escape_hw.api.sensor import SensorGeometry, SlopeFunction
 from escape_hw.bench import Bench
 from escape_hw.calibration.acquisition.frames import FluxMonitor, limit_to_reachable, next_frame
 from escape_hw.calibration.acquisition.sensor_setup import build_slope_function, prepare_sensor
-from escape_hw.calibration.loop.divergence import DivergenceLimits, SaturationMonitor
-from escape_hw.pipeline.control.integrator import Controller
+from escape_hw.calibration.loop.divergence import SaturationMonitor
+from escape_hw.pipeline.control.integrator import LeakyIntegrator
 from escape_hw.pipeline.control.matrix_products import build_command_mapper
 from escape_hw.pipeline.psf.frame_stack import FrameStack
 from escape_hw.pipeline.psf.strehl import is_peak_saturated
@@ -104,7 +104,7 @@ class RunningLoop:
         bench: Bench,
         m2c: NDArray[np.float64],
         slopes_of: SlopeFunction,
-        control: Controller,
+        control: LeakyIntegrator,
         *,
         science: bool = False,
     ) -> None:
@@ -115,7 +115,7 @@ class RunningLoop:
         self.closed_at_ns = self._lost_before = 0
         self._to_actuators, self._to_modes = build_command_mapper(m2c), np.linalg.pinv(m2c)
         self._flux_monitor = FluxMonitor(bench.wfs.name, slopes_of.grid)
-        self._is_saturated = SaturationMonitor(DivergenceLimits.from_config(bench.config), len(m2c))
+        self._is_saturated = SaturationMonitor(bench.config.server, len(m2c))
         self._science = bench.science if science else None
         # Reflection doubles the surface; modes have unit rms surface.
         self._nm_per_unit = 2e9 * bench.dm.info.stroke_m
@@ -131,7 +131,7 @@ class RunningLoop:
         bench: Bench,
         matrix: InteractionMatrix,
         grid: SensorGeometry,
-        control: Controller,
+        control: LeakyIntegrator,
         *,
         science: bool = False,
     ) -> Self:

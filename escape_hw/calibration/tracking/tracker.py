@@ -22,7 +22,7 @@ from escape_hw.calibration.acquisition.pokes import compute_poke_amplitudes
 from escape_hw.calibration.acquisition.slope_statistics import SlopeStatistics
 from escape_hw.calibration.acquisition.telemetry import AlignedTelemetry, TelemetryBuffer
 from escape_hw.calibration.loop.control import build_integrator
-from escape_hw.calibration.loop.divergence import BlockResidualMonitor, DivergenceLimits
+from escape_hw.calibration.loop.divergence import BlockResidualMonitor
 from escape_hw.calibration.loop.runner import SETTLING_S, RunningLoop
 from escape_hw.calibration.optical_gain.smoothing import COEFFICIENT_SIGMA
 from escape_hw.calibration.sprint.fit import sprint, sprint_options_from_config
@@ -164,7 +164,7 @@ class _Tracker:
         self.pending_update: Future[TrackerUpdate | None] | None = None
         self.metrics: dict[str, float] = {}
         self.arrays: dict[str, NDArray[np.float32]] = {}
-        self.divergence_monitor = BlockResidualMonitor(DivergenceLimits.from_config(bench.config))
+        self.divergence_monitor = BlockResidualMonitor(bench.config.server)
 
     def prepare(self, slope_statistics: SlopeStatistics) -> None:
         """Build the model for the closed loop and start the live registration; in the worker thread.

@@ -1,35 +1,12 @@
-"""Protocol of modal controllers, the leaky integrator and its stability limit."""
+"""The leaky integrator and its stability limit."""
 
 from __future__ import annotations
-
-from typing import Protocol
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 from escape_hw.pipeline.control.matrix_products import PACKING_BYTES, PackedMatrix
-
-
-class Controller(Protocol):
-    """Modal controller: computes a modal command from the slopes of each frame."""
-
-    @property
-    def residual(self) -> NDArray[np.float32]:
-        """Reconstructed wavefront of the last frame ``(n_modes,)``."""
-        ...
-
-    def __call__(self, slopes: NDArray[np.float32]) -> NDArray[np.floating]:
-        """Modal command ``(n_modes,)`` for slopes ``(n_slopes,)``; the same array at every call."""
-        ...
-
-    def set_applied(self, modes: NDArray[np.floating]) -> None:
-        """Set the state to the command that the mirror executed ``(n_modes,)``."""
-        ...
-
-    def reset(self) -> None:
-        """Set the state to zero."""
-        ...
 
 
 @njit(cache=True, nogil=True)
