@@ -26,10 +26,7 @@ def standard_error(series: NDArray[np.floating]) -> float:
     window W balances truncation and statistical error (Wolff 2004, Comput. Phys. Commun. 156, 143, eq. 52).
     The bias of the autocovariances about the series' own mean, ``-sigma^2``, is corrected.
 
-    Parameters
-    ----------
-    series
-        Values in order ``(n,)``.
+    ``series``: values in order ``(n,)``.
 
     Returns
     -------
@@ -114,10 +111,7 @@ def compare_pairs(
     Resampled means are divided by their own standard errors, so that the intervals hold also for few pairs,
     for which plain percentiles are too narrow.
 
-    Parameters
-    ----------
-    first, second
-        Values of A and B for the same turbulence ``(n,)``.
+    ``first``, ``second``: values of A and B for the same turbulence ``(n,)``.
 
     Raises
     ------
@@ -146,12 +140,8 @@ def compare_pairs(
 def describe_comparison(first: str, second: str, comparison: PairedComparison, margin: float) -> str:
     """Describe a comparison of Strehl ratios in a sentence, in percent.
 
-    Parameters
-    ----------
-    first, second
-        Names of A and B.
-    margin
-        Difference of the Strehl ratio within which they count as equivalent.
+    ``first``, ``second``: names of A and B; ``margin``: difference of the Strehl ratio within which they
+    count as equivalent.
     """
     confidence = f"{100 * CONFIDENCE:.0f} %"
     mean, sigma, equivalence = 100 * comparison.mean, 100 * comparison.sigma, 100 * comparison.equivalence

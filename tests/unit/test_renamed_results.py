@@ -18,3 +18,9 @@ def test_optical_gains():
     result = fake.gains_result()
     with pytest.warns(DeprecationWarning, match=r"GainsResult.beside is called"):
         assert result.beside is result.comparisons
+
+
+def test_the_delay():
+    response = fake.calibration().response
+    with pytest.warns(DeprecationWarning, match=r"TemporalResponse.delay is called"):
+        assert response.delay == response.delay_frames

@@ -18,12 +18,12 @@ DARK_FRAMES = 25
 DARK_FRACTION = 0.02
 
 
-def validate_frame_count(frames: int, name: str = "frames") -> int:
+def validate_frame_count(frames: int) -> int:
     """Return a number of frames; raise :class:`ConfigError` unless it is an integer of at least one."""
     if isinstance(frames, bool) or not isinstance(frames, int | np.integer):
-        raise ConfigError(f"{name} is {frames!r}; it must be a whole number")
+        raise ConfigError(f"frames is {frames!r}; it must be a whole number")
     if frames < 1:
-        raise ConfigError(f"{name} is {frames}; it must be at least 1")
+        raise ConfigError(f"frames is {frames}; it must be at least 1")
     return frames
 
 
@@ -32,10 +32,7 @@ class FluxMonitor:
 
     Without light slopes are noise or exactly zero, which would pass for a perfect wavefront.
 
-    Parameters
-    ----------
-    grid
-        Geometry with the usual flux of each sub-aperture.
+    ``grid``: geometry with the usual flux of each sub-aperture.
     """
 
     def __init__(self, camera_name: str, grid: SensorGeometry) -> None:
@@ -67,10 +64,7 @@ def limit_to_reachable(dm: DeformableMirror, shape: NDArray[np.float64]) -> NDAr
     What is sent then stays in the span of the modes that the shape and the present shape consist of. The
     guard would clip single actuators instead, and the rest would be taken for a response of the modes.
 
-    Parameters
-    ----------
-    shape
-        Command ``(n_act,)``.
+    ``shape``: command ``(n_act,)``.
     """
     now, target = dm.shape, shape * dm.largest_legal_scale(shape)
     slew, furthest = dm.limits.max_slew, float(np.abs(target - now).max(initial=0.0))
@@ -113,12 +107,8 @@ def build_interaction_matrix(
 ) -> InteractionMatrix:
     """Build an interaction matrix of this bench with its provenance.
 
-    Parameters
-    ----------
-    bench, grid, m2c
-        Bench, sensor geometry and mode-to-command matrix ``(n_act, n_modes)``.
-    data, sigma
-        Matrix and its standard errors ``(n_slopes, n_modes)``.
+    ``bench``, ``grid``, ``m2c``: bench, sensor geometry and mode-to-command matrix ``(n_act, n_modes)``;
+    ``data``, ``sigma``: matrix and its standard errors ``(n_slopes, n_modes)``.
     """
     return InteractionMatrix(
         data.astype(np.float32),

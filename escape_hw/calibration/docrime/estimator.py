@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from escape_hw.calibration.acquisition.telemetry import AlignedBuffer, AlignedTelemetry
+from escape_hw.calibration.acquisition.aligned_telemetry import AlignedBuffer, AlignedTelemetry
 from escape_hw.calibration.docrime.fit import (
     MIN_DEGREES_OF_FREEDOM,
     DocrimeSolution,

@@ -10,7 +10,7 @@ from scipy.linalg import lapack
 
 from escape_hw.api.representation import short_repr
 from escape_hw.api.results import TemporalResponse
-from escape_hw.calibration.acquisition.telemetry import AlignedTelemetry
+from escape_hw.calibration.acquisition.aligned_telemetry import AlignedTelemetry
 from escape_hw.calibration.docrime.regression import InstrumentalVariableSums, RegressionSums
 from escape_hw.calibration.docrime.response import (
     RESPONSE_SLOPES,
@@ -114,12 +114,8 @@ def _correlation(values: NDArray[np.floating], now: NDArray[np.intp], past: NDAr
 class InitialFit:
     """Fit of the first frames.
 
-    Parameters
-    ----------
-    whitener
-        Filter over time ``(order + 1,)``.
-    variance_inflation
-        Factor on the variance of an estimate whose noise is not white.
+    ``whitener``: filter over time ``(order + 1,)``; ``variance_inflation``: factor on the variance of an
+    estimate whose noise is not white.
     """
 
     whitener: NDArray[np.float64]
@@ -286,12 +282,8 @@ def solve_sums(
 ) -> DocrimeSolution:
     """Solve sums for the matrix, its standard errors and the temporal response.
 
-    Parameters
-    ----------
-    raw_sums, tracker
-        Sums and temporal response over all filtered frames; not changed.
-    fit
-        Fit of the first frames. Without a whitening filter the response is not tested for significance.
+    ``raw_sums``, ``tracker``: sums and temporal response over all filtered frames; not changed; ``fit``: fit
+    of the first frames. Without a whitening filter the response is not tested for significance.
 
     Raises
     ------

@@ -44,12 +44,8 @@ class RunMonitor:
     ) -> Procedure[bool]:
         """Save the state and evaluate the criterion, as far as either is due.
 
-        Parameters
-        ----------
-        values, arrays
-            Entries of the state beside the estimator's own.
-        final
-            The run ends here: save the state in any case and do not evaluate the criterion.
+        ``values``, ``arrays``: entries of the state beside the estimator's own; ``final``: the run ends here:
+        save the state in any case and do not evaluate the criterion.
 
         Returns
         -------

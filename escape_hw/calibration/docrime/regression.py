@@ -334,10 +334,7 @@ class ForgettingSums(InstrumentalEquations):
     def build_columns(self, template: InteractionMatrix, matrix: NDArray[np.float64]) -> InteractionMatrix:
         """Build a matrix from the sums whose columns have equal, independent errors.
 
-        Parameters
-        ----------
-        matrix
-            The best known matrix ``(n_slopes, n_modes)``, for the controller's part.
+        ``matrix``: the best known matrix ``(n_slopes, n_modes)``, for the controller's part.
 
         Returns
         -------

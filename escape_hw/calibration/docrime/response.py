@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.linalg import toeplitz
 
 from escape_hw.api.results import TemporalResponse
-from escape_hw.calibration.acquisition.telemetry import AlignedTelemetry
+from escape_hw.calibration.acquisition.aligned_telemetry import AlignedTelemetry, TelemetryRows
 from escape_hw.calibration.docrime.regression import N_SAMPLED_SLOPES, InstrumentalEquations, sampling_step
 from escape_hw.calibration.docrime.whitening import apply_filter
 from escape_hw.errors import CalibrationError
@@ -129,46 +129,21 @@ class LagSums:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class FilteredTelemetry:
-    """Slopes, commands and pokes filtered over time.
+class FilteredTelemetry(TelemetryRows):
+    """Slopes, commands and pokes filtered over time ``(n_rows, ...)``.
 
-    Parameters
-    ----------
-    rows
-        Filtered slopes and commands ``(n_rows, n_slopes + n_modes)``, in closed loop with the filtered pokes
-        beside them.
-    now
-        Usable rows: their slopes and their commands of all lags are known ``(n,)``, increasing.
+    ``now (n,)``, increasing, are the usable rows: their slopes and their commands of all lags are known.
     """
 
     rows: NDArray[np.float32]
     now: NDArray[np.intp]
     n_slopes: int
-    n_modes: int
+    closed: bool
 
     @property
     def slopes(self) -> NDArray[np.float32]:
         """Slopes of the usable rows ``(n, n_slopes)``."""
-        return self.rows_before(0)[:, : self.n_slopes]
-
-    @property
-    def commands(self) -> NDArray[np.float32]:
-        """Commands of all rows ``(n_rows, n_modes)``."""
-        return self.rows[:, self.n_slopes : self.n_slopes + self.n_modes]
-
-    @property
-    def pokes(self) -> NDArray[np.float32]:
-        """Pokes of all rows ``(n_rows, n_modes)``; in open loop these are the commands."""
-        return self.rows[:, self.rows.shape[1] - self.n_modes :]
-
-    @property
-    def closed(self) -> bool:
-        """Whether the telemetry is of a closed loop."""
-        return bool(self.rows.shape[1] > self.n_slopes + self.n_modes)
-
-    def rows_before(self, lag: int) -> NDArray[np.float32]:
-        """Rows that precede the usable ones by ``lag`` rows."""
-        return shift_rows(self.rows, self.now, lag)
+        return shift_rows(self.rows, self.now, 0)[:, : self.n_slopes]
 
     def excitation(self, response: NDArray[np.float64]) -> NDArray[np.float32]:
         """Commands through a response at the usable rows ``(n, n_modes)``; in closed loop also pokes."""
@@ -206,7 +181,7 @@ def filter_telemetry(
     at = at[np.searchsorted(at, start) :]
     first = max(start - lags, order)
     rows = apply_filter(data.rows, whitener, np.arange(first, data.present.size))
-    return FilteredTelemetry(rows, at - first, data.n_slopes, data.n_modes)
+    return FilteredTelemetry(rows, at - first, data.n_slopes, data.closed)
 
 
 def compute_lag_covariances(data: FilteredTelemetry, lags: int) -> NDArray[np.float64]:
@@ -258,12 +233,8 @@ def predict_slopes(
     of each mode have their own spectrum, noisy modes would weigh too much and bias the lags. There each mode
     is shrunk by the ratio of its power without and with noise.
 
-    Parameters
-    ----------
-    matrix
-        Matrix whose errors are independent of the noise of these frames ``(n_modes, n_slopes)``.
-    power
-        Sum of squares of each mode's column without its noise ``(n_modes,)``.
+    ``matrix``: matrix whose errors are independent of the noise of these frames ``(n_modes, n_slopes)``;
+    ``power``: sum of squares of each mode's column without its noise ``(n_modes,)``.
 
     Returns
     -------
@@ -360,12 +331,8 @@ class ResponseTracker:
 
     The matrix of all frames so far predicts the next ones, whose noise is independent of its errors.
 
-    Parameters
-    ----------
-    first
-        Response of the first frames, which the sums of the matrix assume.
-    spectra
-        Output of :func:`compute_lag_covariances` for the first frames.
+    ``first``: response of the first frames, which the sums of the matrix assume; ``spectra``: output of
+    :func:`compute_lag_covariances` for the first frames.
     """
 
     def __init__(self, first: ResponseEstimate, spectra: NDArray[np.float64]) -> None:
@@ -376,10 +343,7 @@ class ResponseTracker:
     def add(self, data: FilteredTelemetry, matrix: NDArray[np.float64], power: NDArray[np.float64]) -> None:
         """Add a block of filtered telemetry, with the rows of the lags before it.
 
-        Parameters
-        ----------
-        matrix
-            Matrix of the frames before it for the sampled slopes ``(n_few, n_modes)``.
+        ``matrix``: matrix of the frames before it for the sampled slopes ``(n_few, n_modes)``.
         """
         step, lags = sampling_step(data.n_slopes), self._first.weights.size
         slopes = data.slopes[:, ::step]
@@ -471,10 +435,7 @@ class ResponseAccumulator:
     def add(self, block: FilteredTelemetry, matrix: NDArray[np.float64]) -> None:
         """Add a block of filtered telemetry with the rows of the lags before it.
 
-        Parameters
-        ----------
-        matrix
-            The best known matrix ``(n_slopes, n_modes)``.
+        ``matrix``: the best known matrix ``(n_slopes, n_modes)``.
         """
         stride = sampling_step(block.n_slopes)
         sampled_matrix = matrix[::stride].T.astype(np.float32)

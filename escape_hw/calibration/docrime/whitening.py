@@ -22,12 +22,7 @@ def fit_prediction_error_filter(
     inaccurate when frames are lost, since turbulence is smooth. One filter for all slopes keeps generalised
     and ordinary least squares equal across slopes for any correlation (Zellner 1962: equal regressors).
 
-    Parameters
-    ----------
-    residuals
-        ``(n_times, n_slopes)``.
-    present
-        ``(n_times,)``; rows where it is false are ignored.
+    ``residuals``: ``(n_times, n_slopes)``; ``present``: ``(n_times,)``; rows where it is false are ignored.
 
     Returns
     -------

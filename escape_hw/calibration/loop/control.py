@@ -20,6 +20,15 @@ from escape_hw.pipeline.control.integrator import LeakyIntegrator
 from escape_hw.pipeline.control.reconstructor import reconstructor
 
 
+def invert_matrix(matrix: InteractionMatrix, dropped_modes: int) -> NDArray[np.float32]:
+    """Reconstructor ``(n_modes, n_slopes)`` of a matrix without its weakest eigenmodes per stroke.
+
+    Raises :class:`CalibrationError` if the matrix cannot be inverted.
+    """
+    stroke = np.sqrt(np.mean(np.square(matrix.m2c), axis=0))
+    return reconstructor(matrix.data, scale=stroke, dropped_modes=dropped_modes)
+
+
 def build_integrator(
     bench: Bench,
     matrix: InteractionMatrix,
@@ -31,10 +40,7 @@ def build_integrator(
 ) -> LeakyIntegrator:
     """Build the leaky integrator that closes the loop with a matrix; nothing moves.
 
-    Parameters
-    ----------
-    gain, leak, dropped_modes
-        Loop parameters; by default as configured.
+    ``gain``, ``leak``, ``dropped_modes``: loop parameters; by default as configured.
 
     Raises
     ------
@@ -57,9 +63,8 @@ def build_integrator(
         )
     if not np.array_equal(matrix.valid, grid.valid):
         raise IncompatibleProduct(f"the matrix and the geometry mark different {grid.elements} as valid")
-    stroke = np.sqrt(np.mean(np.square(matrix.m2c), axis=0))
     dropped = c.dropped_modes if dropped_modes is None else dropped_modes
-    return LeakyIntegrator(reconstructor(matrix.data, scale=stroke, dropped_modes=dropped), gain, leak)
+    return LeakyIntegrator(invert_matrix(matrix, dropped), gain, leak)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,12 +85,8 @@ class LoopSettings:
 class LoopChange:
     """New settings, ready to be applied between two frames.
 
-    Parameters
-    ----------
-    control, slopes_of
-        Controller, and slope function with the references of the calibration.
-    undriven
-        Combinations of modes that the controller does not drive ``(n_modes, n)``, orthonormal.
+    ``control``, ``slopes_of``: controller, and slope function with the references of the calibration;
+    ``undriven``: combinations of modes that the controller does not drive ``(n_modes, n)``, orthonormal.
     """
 
     settings: LoopSettings

@@ -96,12 +96,8 @@ class BlockResidualMonitor:
     def __call__(self, residual: Sequence[float], n_shortened: int) -> bool:
         """Whether the loop diverged in its last block.
 
-        Parameters
-        ----------
-        residual
-            Residual of each frame of the block, in nm.
-        n_shortened
-            Number of commands in the block that the limits shortened.
+        ``residual``: residual of each frame of the block, in nm; ``n_shortened``: number of commands in the
+        block that the limits shortened.
         """
         rms = float(np.sqrt(np.mean(np.square(residual))))
         usual = float(np.median(self._residual)) if len(self._residual) >= _MIN_USUAL_BLOCKS else np.inf

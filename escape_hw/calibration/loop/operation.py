@@ -45,10 +45,7 @@ _N_RESIDUALS = 500
 class RunningStrehl:
     """Strehl ratio of the science frames since the last evaluation, computed in another thread.
 
-    Parameters
-    ----------
-    model
-        PSF without turbulence ``(rows, columns)``.
+    ``model``: PSF without turbulence ``(rows, columns)``.
     """
 
     def __init__(self, model: NDArray[np.float32]) -> None:
@@ -83,10 +80,7 @@ class RunningStrehl:
 class LoopSummary:
     """Summary of a loop that ran until it was opened.
 
-    Parameters
-    ----------
-    fault
-        Why the loop was opened without a request; empty after a request.
+    ``fault``: why the loop was opened without a request; empty after a request.
     """
 
     fault: str

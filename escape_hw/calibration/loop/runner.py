@@ -84,12 +84,7 @@ class RunningLoop:
     Use it as ``with loop.closed(): yield from loop.run(frames)``. Between two frames the controller may get
     another reconstructor or another gain.
 
-    Parameters
-    ----------
-    bench
-        An open bench, its sensor prepared.
-    m2c
-        Mode-to-command matrix ``(n_act, n_modes)``.
+    ``bench``: an open bench, its sensor prepared; ``m2c``: mode-to-command matrix ``(n_act, n_modes)``.
 
     Attributes
     ----------

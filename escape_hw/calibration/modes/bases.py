@@ -61,12 +61,7 @@ def von_karman_covariance(distance_m: NDArray[np.float64], outer_scale_m: float)
     ``x^(5/6) K_5/6(x) 2^(1/6) / Gamma(5/6)`` with ``x = 2 pi r / L0``: the Fourier transform of the
     power spectrum ``(f^2 + 1 / L0^2)^(-11/6)`` (Conan 2000).
 
-    Parameters
-    ----------
-    distance_m
-        Distances of any shape in metres.
-    outer_scale_m
-        Outer scale in metres.
+    ``distance_m``: distances of any shape in metres; ``outer_scale_m``: outer scale in metres.
     """
     x = 2 * np.pi * np.maximum(distance_m, 1e-9 * outer_scale_m) / outer_scale_m
     return np.asarray(x ** (5 / 6) * special.kv(5 / 6, x) * (2 ** (1 / 6) / special.gamma(5 / 6)))
@@ -173,12 +168,7 @@ def zonal(surfaces: NDArray[np.float64], pupil: NDArray[np.bool_], n_modes: int)
 def zernike(surfaces: NDArray[np.float64], pupil: NDArray[np.bool_], n_modes: int) -> NDArray[np.float64]:
     """Zernike modes without piston, in Noll's order ``(n_act, n_modes)`` (Noll 1976).
 
-    Parameters
-    ----------
-    surfaces
-        Influence functions ``(n_act, n, n)``.
-    pupil
-        Boolean ``(n, n)``.
+    ``surfaces``: influence functions ``(n_act, n, n)``; ``pupil``: Boolean ``(n, n)``.
 
     Raises
     ------

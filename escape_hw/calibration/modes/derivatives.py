@@ -25,12 +25,8 @@ def modal_matrix(
 ) -> NDArray[np.float64]:
     """Slopes per unit of each mode ``(n_slopes, n_modes)``.
 
-    Parameters
-    ----------
-    m2c
-        Mode-to-command matrix ``(n_act, n_modes)``.
-    width
-        Scale of the influence functions' width relative to nominal.
+    ``m2c``: mode-to-command matrix ``(n_act, n_modes)``; ``width``: scale of the influence functions' width
+    relative to nominal.
     """
     if isinstance(model, DifferentiableModel):
         return model.modal_matrix(registration, m2c, width)
@@ -70,12 +66,8 @@ def pedestal_jacobian(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Slopes of the broad pedestal of the influence functions, and their derivatives.
 
-    Parameters
-    ----------
-    width
-        Scale of the influence functions' width; that of the pedestal is a fixed multiple of it.
-    m2c
-        Modes ``(n_act, n_modes)``; single actuators by default.
+    ``width``: scale of the influence functions' width; that of the pedestal is a fixed multiple of it;
+    ``m2c``: modes ``(n_act, n_modes)``; single actuators by default.
 
     Returns
     -------

@@ -34,12 +34,8 @@ def smooth_over_modes(
     independent. The result is an average over the sizes of curvature and departures, weighted by the
     restricted likelihood, with the noise given by the standard errors.
 
-    Parameters
-    ----------
-    value, sigma
-        Gain of every mode and its standard error ``(n_modes,)``, infinite where it was not measured.
-    common_sigma
-        Relative standard error common to all modes, copied to the result.
+    ``value``, ``sigma``: gain of every mode and its standard error ``(n_modes,)``, infinite where it was not
+    measured; ``common_sigma``: relative standard error common to all modes, copied to the result.
 
     Raises
     ------

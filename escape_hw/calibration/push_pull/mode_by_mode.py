@@ -93,12 +93,8 @@ class ModeByModeRun(abc.ABC):
     def measure(self, grid: SensorGeometry | None, settings: Mapping[str, Any]) -> Procedure[bool]:
         """Measure all steps; the mirror is flat in the end.
 
-        Parameters
-        ----------
-        grid
-            Geometry of the sensor; found first if not given.
-        settings
-            Plain values that must be the same when the run is resumed.
+        ``grid``: geometry of the sensor; found first if not given; ``settings``: plain values that must be
+        the same when the run is resumed.
 
         Returns
         -------

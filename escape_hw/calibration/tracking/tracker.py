@@ -18,10 +18,10 @@ from escape_hw.api.results import CalibrationResult, RegistrationEstimate, Tempo
 from escape_hw.api.sensor import SensorGeometry
 from escape_hw.api.tracking import Alarm, TrackResult
 from escape_hw.bench import Bench
+from escape_hw.calibration.acquisition.aligned_telemetry import AlignedTelemetry, TelemetryBuffer
 from escape_hw.calibration.acquisition.pokes import compute_poke_amplitudes
 from escape_hw.calibration.acquisition.slope_statistics import SlopeStatistics
-from escape_hw.calibration.acquisition.telemetry import AlignedTelemetry, TelemetryBuffer
-from escape_hw.calibration.loop.control import build_integrator
+from escape_hw.calibration.loop.control import build_integrator, invert_matrix
 from escape_hw.calibration.loop.divergence import BlockResidualMonitor
 from escape_hw.calibration.loop.runner import SETTLING_S, RunningLoop
 from escape_hw.calibration.optical_gain.smoothing import COEFFICIENT_SIGMA
@@ -31,7 +31,6 @@ from escape_hw.calibration.tracking.alarms import AlarmMonitor
 from escape_hw.calibration.tracking.exchange import (
     ActiveReconstructor,
     ExchangeProposal,
-    invert_matrix,
     propose_exchange,
 )
 from escape_hw.calibration.tracking.live_registration import LiveEstimate, LiveRegistration

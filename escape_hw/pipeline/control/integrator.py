@@ -10,17 +10,16 @@ from escape_hw.pipeline.control.matrix_products import PACKING_BYTES, PackedMatr
 
 
 @njit(cache=True, nogil=True)
-def _step(matrix, slopes, retention, gains, residual, state):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Reconstruct and integrate; compiled as a whole because calls dominate in small systems."""
-    np.dot(matrix, slopes, residual)
+def _integrate(retention, gains, residual, state):  # type: ignore[no-untyped-def]  # pragma: no cover
     for k in range(state.size):
         state[k] = retention * state[k] - gains[k] * residual[k]
 
 
 @njit(cache=True, nogil=True)
-def _integrate(retention, gains, residual, state):  # type: ignore[no-untyped-def]  # pragma: no cover
-    for k in range(state.size):
-        state[k] = retention * state[k] - gains[k] * residual[k]
+def _step(matrix, slopes, retention, gains, residual, state):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Reconstruct and integrate; compiled as a whole because calls dominate in small systems."""
+    np.dot(matrix, slopes, residual)
+    _integrate(retention, gains, residual, state)
 
 
 def gain_limit(delay_frames: float) -> float:
@@ -29,10 +28,7 @@ def gain_limit(delay_frames: float) -> float:
     ``2 sin(pi / (2 (2 d - 1)))``, from the phase margin of ``c[k] = c[k-1] - g c[k-d]``; exact for whole
     delays (2 for one frame, 1 for two).
 
-    Parameters
-    ----------
-    delay_frames
-        Frames from a command to the slopes that show it, at least 1.
+    ``delay_frames``: frames from a command to the slopes that show it, at least 1.
     """
     d = max(delay_frames, 1.0)
     return float(2 * np.sin(np.pi / (2 * (2 * d - 1))))

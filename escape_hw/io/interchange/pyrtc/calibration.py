@@ -471,7 +471,7 @@ def _record(result: CalibrationResult, matrix: InteractionMatrix) -> dict[str, A
         "slope_unit": matrix.slope_unit,
         "frames": result.frames,
         "lost_frames": result.lost_frames,
-        "delay_frames": None if result.response is None else result.response.delay,
+        "delay_frames": None if result.response is None else result.response.delay_frames,
         **registration_document(result.registration),
     }
 

@@ -5,15 +5,38 @@ Gaps in the index remove pairs; ``docrime.estimator`` and ``sprint.telemetry_fit
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import isfinite
 
 import numpy as np
 from numpy.typing import NDArray
 
 
+class TelemetryRows:
+    """Slopes and commands side by side, and in closed loop the pokes; one row per frame."""
+
+    rows: NDArray[np.float32]
+    n_slopes: int
+    closed: bool
+
+    @property
+    def n_modes(self) -> int:
+        """Number of modes."""
+        return int(self.rows.shape[1] - self.n_slopes) // (2 if self.closed else 1)
+
+    @property
+    def commands(self) -> NDArray[np.float32]:
+        """``(n_times, n_modes)``; in closed loop the sum of controller and poke."""
+        return self.rows[:, self.n_slopes : self.n_slopes + self.n_modes]
+
+    @property
+    def pokes(self) -> NDArray[np.float32]:
+        """``(n_times, n_modes)``; in open loop these are the commands."""
+        return self.rows[:, self.rows.shape[1] - self.n_modes :]
+
+
 @dataclass(frozen=True, slots=True, eq=False)
-class AlignedTelemetry:
+class AlignedTelemetry(TelemetryRows):
     """A stretch of a run, one row per frame index, lost frames included.
 
     Parameters
@@ -36,21 +59,6 @@ class AlignedTelemetry:
     def slopes(self) -> NDArray[np.float32]:
         """``(n_times, n_slopes)``."""
         return self.rows[:, : self.n_slopes]
-
-    @property
-    def n_modes(self) -> int:
-        """Number of modes."""
-        return int(self.rows.shape[1] - self.n_slopes) // (2 if self.closed else 1)
-
-    @property
-    def commands(self) -> NDArray[np.float32]:
-        """``(n_times, n_modes)``; in closed loop the sum of controller and poke."""
-        return self.rows[:, self.n_slopes : self.n_slopes + self.n_modes]
-
-    @property
-    def pokes(self) -> NDArray[np.float32]:
-        """``(n_times, n_modes)``; in open loop these are the commands."""
-        return self.rows[:, self.rows.shape[1] - self.n_modes :]
 
     def find_complete_rows(self, past: int, lags: int) -> NDArray[np.intp]:
         """Rows with ``past`` present slopes before them, and with known commands of ``past + lags`` rows."""
@@ -174,12 +182,8 @@ class AlignedBuffer:
 class TelemetryBuffer:
     """Collects the telemetry of a running loop in blocks; an observer of the loop.
 
-    Parameters
-    ----------
-    rows
-        Frames of a block.
-    history_rows
-        Rows that each block repeats of the previous one: the past of its first frames.
+    ``rows``: frames of a block; ``history_rows``: rows that each block repeats of the previous one: the past
+    of its first frames.
 
     Attributes
     ----------
@@ -223,6 +227,6 @@ class TelemetryBuffer:
     def take_block(self) -> tuple[AlignedTelemetry, int]:
         """A copy of the rows collected, and how many rows at its start an earlier block contained."""
         data, start = self._buffer.telemetry(), self._buffer.n_retained
-        block = AlignedTelemetry(data.rows.copy(), data.present.copy(), data.n_slopes, data.closed)
+        block = replace(data, rows=data.rows.copy(), present=data.present.copy())
         self._buffer.retain_last(self._history_rows)
         return block, start
