@@ -260,8 +260,6 @@ def find_sensor(
 
     Parameters
     ----------
-    bench
-        An open bench.
     frames
         Number of frames to average.
     references

@@ -378,7 +378,7 @@ def whiten_columns(
 
 def _products(rows: NDArray[Any], dimensions: int) -> NDArray[Any]:
     """Sum over rows ``(n, n_columns)`` of their outer products, or the diagonal of it in one dimension."""
-    return rows.T @ rows if dimensions == 2 else np.einsum("ts,ts->s", rows, rows)
+    return np.asarray(rows.T @ rows if dimensions == 2 else np.einsum("ts,ts->s", rows, rows))
 
 
 def sampling_step(n_slopes: int) -> int:

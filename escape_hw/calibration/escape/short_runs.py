@@ -15,7 +15,7 @@ from escape_hw.api.procedure import Procedure, Reporter
 from escape_hw.api.results import CalibrationResult
 from escape_hw.api.sensor import SensorGeometry
 from escape_hw.bench import Bench
-from escape_hw.calibration.acquisition.aligned_telemetry import AlignedTelemetry, TelemetryBuffer
+from escape_hw.calibration.acquisition.aligned_telemetry import TelemetryBuffer
 from escape_hw.calibration.acquisition.frames import (
     build_interaction_matrix,
     validate_frame_count,
@@ -183,7 +183,10 @@ def calibrate_short_run_closed_loop(
     slope_statistics = SlopeStatistics(closed_loop.grid.n_slopes)
     yield from _record_frames(loop, frames, poke, past, buffer, slope_statistics)
     geometry = slope_statistics.annotate_geometry(closed_loop.grid, closed=True)
-    data = _take_telemetry(buffer, c.whiten_order + c.lags)
+    data, _ = buffer.take_block()
+    # Slopes without known commands of all lags and filters count as lost.
+    unknown = slice(c.whiten_order + c.lags)
+    data.present[unknown], data.slopes[unknown] = False, 0
     registration = closed_loop.registration
     fit = yield from fit_telemetry(
         data, closed_loop.matrix, bench.model(geometry), order=order, lags=c.lags,
@@ -224,11 +227,3 @@ def _record_frames(
                 f"aborted after {loop.record.frames} of {n_frames} frames, too few for a registration"
             ) from None
     require_not_diverged(loop.record.diverged, loop.record.frames)
-
-
-def _take_telemetry(buffer: TelemetryBuffer, n_unknown: int) -> AlignedTelemetry:
-    """The recorded telemetry; slopes without known commands of all lags and filters count as lost."""
-    data, _ = buffer.take_block()
-    data.present[:n_unknown] = False
-    data.slopes[:n_unknown] = 0
-    return data

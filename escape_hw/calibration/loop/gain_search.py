@@ -62,8 +62,6 @@ def find_best_gain(
 
     Parameters
     ----------
-    bench
-        An open bench.
     matrix, grid
         Interaction matrix, and the sensor geometry that it was measured on.
     gains

@@ -39,8 +39,6 @@ def close_loop(
 
     Parameters
     ----------
-    bench
-        An open bench.
     matrix, grid
         Interaction matrix, and the sensor geometry that it was measured on.
     gain, leak, dropped_modes

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -191,7 +192,7 @@ class _Bootstrap:
             segment = yield from loop.measure(
                 self._min_frames, amplitude,
                 f"round {len(self._rounds) + 1}, poke {amplitude.max():.2g}", max_frames=max_frames,
-                is_sufficient=lambda gains, target=accuracy: _relative_error(_smooth(gains)) <= target,
+                is_sufficient=partial(_is_accurate, target=accuracy),
             )  # fmt: skip
             if segment.diverged or segment.gains is None or self._residual_is_high(segment):
                 self._lower_gain(segment)
@@ -317,6 +318,10 @@ class _Bootstrap:
 def _smooth(measured: OpticalGainEstimate, reference: int = 0) -> OpticalGains:
     """Gains relative to one of the matrices of the loop, smoothed over the modes."""
     return smooth_over_modes(measured.value[reference], measured.sigma[reference], measured.common_sigma)
+
+
+def _is_accurate(measured: OpticalGainEstimate, target: float) -> bool:
+    return _relative_error(_smooth(measured)) <= target
 
 
 def _relative_error(gains: OpticalGains) -> float:

@@ -52,10 +52,6 @@ class ModeByModeRun(abc.ABC):
     """
 
     method: ClassVar[str]
-    #: References of the geometry, as for :func:`~escape_hw.calibration.acquisition.sensor_setup.find_sensor`.
-    references: str = "design"
-    #: Number of steps in all.
-    n_steps: int
     grid: SensorGeometry
     slopes_of: SlopeFunction
     report: Reporter
@@ -69,6 +65,16 @@ class ModeByModeRun(abc.ABC):
         self.amplitude = compute_poke_amplitudes(bench, self.m2c, poke)
         reject_accuracy_target(until)
         self.steps: list[Measurement] = []
+
+    @property
+    @abc.abstractmethod
+    def n_steps(self) -> int:
+        """Number of steps in all."""
+
+    @property
+    def references(self) -> str:
+        """As for :func:`~escape_hw.calibration.acquisition.sensor_setup.find_sensor`."""
+        return "design"
 
     @abc.abstractmethod
     def measure_step(self, step: int) -> Procedure[Measurement]:

@@ -54,15 +54,8 @@ def modulation_demodulation(
         An open bench, loop open.
     frames
         Frames per batch; by default as configured (``calibration.modulated_frames``).
-    poke
-        Amplitude of each mode, rms surface as fraction of full stroke; by default as configured.
-    grid
-        Geometry of the sensor; found first if not given.
-    until
-        Repeat each batch until all its modes have this signal-to-noise ratio, at most
-        :data:`~escape_hw.calibration.push_pull.mode_by_mode.MAX_ROUNDS` times.
-    checkpoint
-        Where the state is saved, and the state to resume from.
+    poke, grid, until, checkpoint
+        As for :func:`~escape_hw.calibration.push_pull.procedure.push_pull`, with batches for modes.
 
     Returns
     -------
@@ -72,16 +65,10 @@ def modulation_demodulation(
 
     Raises
     ------
-    ConfigError
-        The number of frames, the poke or the target is out of range; nothing moved.
-    ProductError
-        The state to resume from is damaged or of another run; nothing moved.
+    ConfigError, ProductError, CalibrationError, Aborted
+        As for :func:`~escape_hw.calibration.push_pull.procedure.push_pull`.
     TooFewFrames
-        Too few frames for a single line.
-    CalibrationError
-        No spots or pupil images, no light, or no response.
-    Aborted
-        Aborted before the first batch was measured.
+        Too few frames for a single line; nothing moved.
     """
     c = bench.config.calibration
     n_frames = c.modulated_frames if frames is None else validate_frame_count(frames)

@@ -72,10 +72,6 @@ def find_pupil_images(
         ``"mean"``: the mean slopes (with a source); ``"design"``: the mean slopes without their smooth part
         (without a source; see :func:`~escape_hw.api.pyramid.remove_low_orders`).
 
-    Returns
-    -------
-    PyramidPupils
-
     Raises
     ------
     CalibrationError
