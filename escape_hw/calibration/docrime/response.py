@@ -283,15 +283,15 @@ def fit_halves(sampled: FilteredTelemetry, lags: int) -> list[HalfFit]:
     slopes = sampled.slopes - sampled.slopes.mean(axis=0)
     commands = sampled.commands - sampled.commands.mean(axis=0)
     pokes = sampled.pokes - sampled.pokes.mean(axis=0) if sampled.closed else commands
-    best_lag = _find_strongest_lag(slopes, pokes, now, lags)
+    few = np.ascontiguousarray(slopes[:, ::3])
+    powers = [np.square(few.T @ shift_rows(pokes, now, lag)).sum() for lag in range(lags)]
+    best_lag = int(np.argmax(powers))
     middle = now.size // 2
     parts = [slice(0, middle), slice(middle, now.size)]
-    matrices = [
-        _instrumental_matrix(
-            slopes[part], shift_rows(commands, now[part], best_lag), shift_rows(pokes, now[part], best_lag)
-        )
-        for part in parts
-    ]
+    matrices = []
+    for part in parts:
+        rows = (shift_rows(excitation, now[part], best_lag) for excitation in (commands, pokes))
+        matrices.append(InstrumentalEquations.from_rows(slopes[part], *rows).solve(_DAMPING).T)
     # The noise of the two halves is independent.
     power = np.einsum("ms,ms->m", *matrices, dtype=np.float64)
     fits = []
@@ -310,20 +310,6 @@ def fit_halves(sampled: FilteredTelemetry, lags: int) -> list[HalfFit]:
 def stack_lags(rows: NDArray[np.float32], now: NDArray[np.intp], lags: int) -> NDArray[np.float32]:
     """``rows[now - lag]`` for every lag ``(n, lags, n_columns)``."""
     return np.stack([shift_rows(rows, now, lag) for lag in range(lags)], axis=1)
-
-
-def _find_strongest_lag(
-    slopes: NDArray[np.float32], pokes: NDArray[np.float32], now: NDArray[np.intp], lags: int
-) -> int:
-    sampled = np.ascontiguousarray(slopes[:, ::3])
-    return int(np.argmax([np.square(sampled.T @ shift_rows(pokes, now, lag)).sum() for lag in range(lags)]))
-
-
-def _instrumental_matrix(
-    slopes: NDArray[np.float32], commands: NDArray[np.float32], pokes: NDArray[np.float32]
-) -> NDArray[np.float32]:
-    """Damped matrix ``(n_modes, n_slopes)`` with pokes as instruments of the commands."""
-    return InstrumentalEquations.from_rows(slopes, commands, pokes).solve(_DAMPING).T
 
 
 class ResponseTracker:

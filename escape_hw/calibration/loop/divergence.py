@@ -64,7 +64,8 @@ class ResidualMonitor:
             if n <= _PRESENT_FRAMES:
                 self._initial_max = max(self._initial_max, square)
             self._present += (square - self._present) / min(n, _PRESENT_FRAMES)
-            if n > 2 * _PRESENT_FRAMES and self._present > self._limit():
+            limit = max(self._factor**2 * self._usual, self._initial_max)
+            if n > 2 * _PRESENT_FRAMES and self._present > limit:
                 self._n_diverging += 1
             else:
                 self._n_diverging = 0
@@ -76,9 +77,6 @@ class ResidualMonitor:
     def growth(self) -> float:
         """Present rms divided by the usual rms."""
         return math.sqrt(self._present / self._usual) if self._usual > 0 else math.nan
-
-    def _limit(self) -> float:
-        return max(self._factor**2 * self._usual, self._initial_max)
 
 
 class BlockResidualMonitor:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import math
 import time
-from array import array
 from collections.abc import Mapping
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager
@@ -20,10 +19,10 @@ from escape_hw.bench import Bench
 from escape_hw.calibration.acquisition.sensor_setup import prepare_sensor
 from escape_hw.calibration.loop.control import LoopChange, LoopControl, LoopSettings
 from escape_hw.calibration.loop.divergence import ResidualMonitor
+from escape_hw.calibration.loop.performance import peak_strehl
 from escape_hw.calibration.loop.runner import RunningLoop
 from escape_hw.errors import Aborted, CalibrationError, CommandRejected, FrameTimeout
 from escape_hw.pipeline.psf.frame_stack import FrameStack
-from escape_hw.pipeline.psf.strehl import strehl
 from escape_hw.pipeline.statistics import MIN_SAMPLES
 from escape_hw.streams.realtime import PRIORITY, isolated_cpus, realtime_thread
 from escape_hw.streams.timing import TimingSummary
@@ -61,19 +60,12 @@ class RunningStrehl:
             self._value, self._pending = self._pending.result() or self._value, None
         if images.count < MIN_SAMPLES:
             return False
-        self._pending = pool.submit(self._evaluate, images)
+        self._pending = pool.submit(peak_strehl, images, self._model)
         return True
 
     def metrics(self) -> dict[str, float]:
         """Latest Strehl ratio of the peak, and its standard error; NaN before the first."""
         return {"strehl": self._value.value, "strehl_sigma": self._value.sigma}
-
-    def _evaluate(self, images: FrameStack) -> Estimate | None:
-        try:
-            return strehl(images.images(), self._model).peak
-        except CalibrationError as error:
-            log.warning("no Strehl ratio: %s", error)
-            return None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -209,16 +201,13 @@ class _ContinuousLoop:
                 "the actuators stayed at their limits: lower the gain or drop more modes; if that does not "
                 "help, measure the matrix again"
             )
-        if self.residual_monitor(self._residuals_since(before)):
+        residual = loop.record.residual
+        if self.residual_monitor(residual[len(residual) - (loop.record.frames - before) :]):
             return (
                 f"the residual grew {self.residual_monitor.growth:.2g}-fold: lower the gain, drop more "
                 "modes, or measure the matrix again"
             )
         return ""
-
-    def _residuals_since(self, frames: int) -> array[float]:
-        residual = self.loop.record.residual
-        return residual[len(residual) - (self.loop.record.frames - frames) :]
 
     def _handle_requests(self, pool: ThreadPoolExecutor) -> None:
         """Apply requests and start evaluations, in less than the time of a frame."""

@@ -178,7 +178,7 @@ def zernike(surfaces: NDArray[np.float64], pupil: NDArray[np.bool_], n_modes: in
     x, y = _unit_coordinates(pupil)
     r, angle = np.hypot(x, y), np.arctan2(y, x)
     shapes = [
-        _radial_polynomial(n, abs(m), r) * _azimuthal_factor(m, angle)
+        _radial_polynomial(n, abs(m), r) * (np.cos(m * angle) if m >= 0 else np.sin(-m * angle))
         for n, m in islice(_noll_orders(), n_modes)
     ]
     return _fit_shapes(surfaces, pupil, np.array(shapes), "Zernike")
@@ -228,10 +228,6 @@ def _radial_polynomial(n: int, m: int, r: NDArray[np.float64]) -> NDArray[np.flo
         denominator = factorial(k) * factorial((n + m) // 2 - k) * factorial((n - m) // 2 - k)
         total += (-1) ** k * factorial(n - k) / denominator * r ** (n - 2 * k)
     return total
-
-
-def _azimuthal_factor(m: int, angle: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.asarray(np.cos(m * angle) if m >= 0 else np.sin(-m * angle))
 
 
 def _fourier_frequencies() -> Iterator[tuple[int, int]]:
