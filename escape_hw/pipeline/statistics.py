@@ -28,10 +28,7 @@ def standard_error(series: NDArray[np.floating]) -> float:
 
     ``series``: values in order ``(n,)``.
 
-    Returns
-    -------
-    float
-        NaN for fewer than :data:`MIN_SAMPLES` values.
+    Returns NaN for fewer than :data:`MIN_SAMPLES` values.
     """
     n = series.size
     if n < MIN_SAMPLES:

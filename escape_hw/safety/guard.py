@@ -108,10 +108,7 @@ class CommandGuard:
     def validate(self, command: ArrayLike) -> NDArray[np.float64]:
         """Check type, shape and finiteness.
 
-        Returns
-        -------
-        ndarray of float64, ``(n_act,)``
-            A new C-contiguous array.
+        Returns a new C-contiguous array ``(n_act,)``, float64.
 
         Raises
         ------
@@ -252,9 +249,7 @@ class CommandGuard:
     ) -> tuple[NDArray[np.float64], int, int, float, float]:
         """Bring a shape within every rule except slew.
 
-        Returns
-        -------
-        legal, clipped, disabled, scale, mean_removed
+        Returns the legal shape, and as in :class:`GuardReport` clipped, disabled, scale and mean removed.
         """
         lim = self.limits
         disabled = int(np.count_nonzero(requested[self._disabled]))

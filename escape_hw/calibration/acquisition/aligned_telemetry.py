@@ -118,10 +118,7 @@ class AlignedBuffer:
     def append_one(self, slopes: NDArray[np.floating], excitation: NDArray[np.floating]) -> int:
         """Append one frame; the buffer must not be full.
 
-        Returns
-        -------
-        int
-            Remaining room in frames; -1 if the frame is not finite, in which case it is not appended.
+        Returns the remaining room in frames; -1 if the frame is not finite, in which case it is not appended.
         """
         if not self._row_views:
             rows = self._rows

@@ -76,10 +76,7 @@ def limit_to_reachable(dm: DeformableMirror, shape: NDArray[np.float64]) -> NDAr
 def ramp_to(dm: DeformableMirror, shape: NDArray[np.float64]) -> SendReport:
     """Send a shape, scaled to obey the limits, in as many commands as the slew limit requires.
 
-    Returns
-    -------
-    SendReport
-        Report of the last command; its ``sent`` is the shape of the mirror.
+    Returns the report of the last command; its ``sent`` is the shape of the mirror.
     """
     while True:
         before = dm.shape

@@ -112,10 +112,7 @@ class OpenLoopAcquisition:
         ``frames``: number of frames, including those of a resumed run; ``pokes``: source of the modal poke of
         each frame ``(n_modes,)``.
 
-        Returns
-        -------
-        bool
-            Whether the run was aborted; false if it ended by its stopping criterion.
+        Returns whether the run was aborted; false if it ended by its stopping criterion.
         """
         bench, to_modes = self.bench, np.linalg.pinv(self.m2c)
         self._n_planned = frames

@@ -77,10 +77,7 @@ class ClosedLoopAcquisition:
     def poke(self, frames: int, pokes: PokeSequence, stage: str) -> Procedure[bool]:
         """Close the loop, inject pokes until the estimator has a number of frames, and open the loop.
 
-        Returns
-        -------
-        bool
-            Whether the run was aborted.
+        Returns whether the run was aborted.
 
         Raises
         ------

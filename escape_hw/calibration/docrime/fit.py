@@ -133,10 +133,7 @@ def create_sums(n_slopes: int, n_modes: int, closed: bool, *, correlations: bool
 def fit_first_frames(data: AlignedTelemetry, order: int, lags: int) -> InitialFit | None:
     """Estimate temporal response and whitening filter, first from frame differences, then iteratively.
 
-    Returns
-    -------
-    InitialFit or None
-        ``None`` if there are too few frames.
+    Returns ``None`` if there are too few frames.
 
     Raises
     ------

@@ -47,10 +47,7 @@ class RunMonitor:
         ``values``, ``arrays``: entries of the state beside the estimator's own; ``final``: the run ends here:
         save the state in any case and do not evaluate the criterion.
 
-        Returns
-        -------
-        bool
-            Whether the criterion is met.
+        Returns whether the criterion is met.
         """
         if self._checkpoint is not None and (final or self._checkpoint.is_due()):
             own_values, own_arrays = estimator.state()

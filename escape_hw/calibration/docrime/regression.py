@@ -336,10 +336,7 @@ class ForgettingSums(InstrumentalEquations):
 
         ``matrix``: the best known matrix ``(n_slopes, n_modes)``, for the controller's part.
 
-        Returns
-        -------
-        InteractionMatrix
-            ``(n_slopes, rank)``, its modes rotated and not of unit rms.
+        Returns ``(n_slopes, rank)``, its modes rotated and not of unit rms.
         """
         factor = float(np.median(np.diag(self.command_poke_products) / np.diag(self.poke_products)))
         cross = self.poke_response(matrix, factor)

@@ -212,10 +212,7 @@ def fit_response(data: AlignedTelemetry, whitener: NDArray[np.float64], lags: in
     scales all weights alike, and they are scaled to sum 1. In closed loop the pokes are the instruments of
     the commands, for the matrix and for the weights.
 
-    Returns
-    -------
-    ResponseEstimate
-        Its errors allow for correlations between slopes.
+    The errors of the result allow for correlations between slopes.
     """
     sums = LagSums(lags)
     for part in fit_halves(filter_telemetry(data.select_slopes(RESPONSE_SLOPES), whitener, lags), lags):

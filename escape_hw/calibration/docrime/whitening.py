@@ -24,10 +24,7 @@ def fit_prediction_error_filter(
 
     ``residuals``: ``(n_times, n_slopes)``; ``present``: ``(n_times,)``; rows where it is false are ignored.
 
-    Returns
-    -------
-    ndarray, ``(order + 1,)``
-        ``[1, -a_1, ..., -a_order]``.
+    Returns ``[1, -a_1, ..., -a_order]``.
     """
     if order == 0:
         return np.ones(1)
@@ -53,6 +50,8 @@ def apply_filter(
 ) -> NDArray[np.float32]:
     """Filter rows in single precision: ``sum_k weights[k] values[at - k]``.
 
+    Returns ``(at.size, n - column)``.
+
     Parameters
     ----------
     values
@@ -61,10 +60,6 @@ def apply_filter(
         Filter, latest row first.
     at
         Indices of the rows to return, increasing. All rows between the first and the last are computed.
-
-    Returns
-    -------
-    ndarray, ``(at.size, n - column)``
     """
     source = np.ascontiguousarray(values, dtype=np.float32)
     if not at.size:

@@ -53,10 +53,7 @@ def calibrate_short_run(
     ``frames``: number of frames; the geometry of the sensor is found on them as well, unless ``grid`` is
     given; ``poke``: pokes are uniform in +-poke on every mode, rms surface as fraction of full stroke.
 
-    Returns
-    -------
-    CalibrationResult
-        Without a measured matrix.
+    The result has no measured matrix.
 
     Raises
     ------

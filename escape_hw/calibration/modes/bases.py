@@ -79,6 +79,8 @@ def karhunen_loeve(
     Double diagonalisation (Gendron 1995): modes that are orthonormal over the pupil without piston, with
     uncorrelated coefficients of the turbulence, ordered by decreasing variance.
 
+    Returns ``(n_act, n_modes)``, columns with unit rms surface over the pupil, signs fixed.
+
     Parameters
     ----------
     surfaces
@@ -91,11 +93,6 @@ def karhunen_loeve(
         Number of modes, at most ``n_act - 1``.
     outer_scale_m
         Outer scale of the turbulence in metres.
-
-    Returns
-    -------
-    ndarray, ``(n_act, n_modes)``
-        Columns with unit rms surface over the pupil, signs fixed.
 
     Raises
     ------

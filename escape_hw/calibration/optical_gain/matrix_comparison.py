@@ -79,9 +79,7 @@ def projector(reference: InteractionMatrix, weights: NDArray[np.float64]) -> NDA
     ``reference``: matrix relative to which the gains are defined; ``weights``: weights of the slopes
     ``(n_slopes,)``, independent of the values of the data.
 
-    Returns
-    -------
-    ndarray, ``(n_modes, n_slopes)``
+    Returns ``(n_modes, n_slopes)``.
 
     Raises
     ------

@@ -102,10 +102,7 @@ class ModeByModeRun(abc.ABC):
         ``grid``: geometry of the sensor; found first if not given; ``settings``: plain values that must be
         the same when the run is resumed.
 
-        Returns
-        -------
-        bool
-            Whether the run was aborted after its first step; before, :class:`Aborted` is raised.
+        Returns whether the run was aborted after its first step; before, :class:`Aborted` is raised.
         """
         bench, checkpoint = self.bench, self._checkpoint
         state = None if checkpoint is None else checkpoint.begin(bench, self.method, self.m2c, settings)

@@ -16,6 +16,8 @@ def reconstructor(
 ) -> NDArray[np.float32]:
     """Truncated pseudo-inverse ``R = V Sigma^+(phi) U^T`` (paper) with the ``phi`` largest singular values.
 
+    Returns ``(n_modes, n_slopes)``, float32.
+
     Parameters
     ----------
     matrix
@@ -25,10 +27,6 @@ def reconstructor(
         per stroke, so that the weakest eigenmodes need most stroke for least signal.
     dropped_modes
         Number of the weakest eigenmodes that are left out.
-
-    Returns
-    -------
-    ndarray of float32, ``(n_modes, n_slopes)``
 
     Raises
     ------

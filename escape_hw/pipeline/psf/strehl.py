@@ -22,6 +22,8 @@ def diffraction_psf(
 ) -> NDArray[np.float32]:
     """Diffraction image of a pupil, by a matrix Fourier transform (Soummer et al. 2007).
 
+    Returns an image of unit sum over an infinite camera, with its peak on the middle pixel.
+
     Parameters
     ----------
     pupil
@@ -32,11 +34,6 @@ def diffraction_psf(
         lambda/D in camera pixels.
     shape
         Camera region (rows, columns).
-
-    Returns
-    -------
-    ndarray of float32, ``(rows, columns)``
-        Of unit sum over an infinite camera, with its peak on the middle pixel.
     """
     n = pupil.shape[0]
     places = (np.arange(n) - (n - 1) / 2) / samples_across
@@ -165,10 +162,7 @@ def strehl(frames: NDArray[np.floating], model: NDArray[np.floating]) -> StrehlE
     ``frames``: science frames in order ``(n, rows, columns)``; ``model``: model PSF, taken without
     turbulence.
 
-    Returns
-    -------
-    StrehlEstimate
-        Errors are NaN for fewer than :data:`~escape_hw.pipeline.statistics.MIN_SAMPLES` frames.
+    Errors are NaN for fewer than :data:`~escape_hw.pipeline.statistics.MIN_SAMPLES` frames.
 
     Raises
     ------
