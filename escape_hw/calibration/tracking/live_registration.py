@@ -1,9 +1,10 @@
 """Live registration: one Gauss-Newton update of SPRINT per block of closed-loop telemetry.
 
 The updates use sums of the whitened telemetry with exponential forgetting
-(:class:`~escape_hw.calibration.docrime.regression.ForgettingSums`), start from the last estimate, and have the unknowns
-of a full fit: gain, registration, random effects, and on a pyramid the optical gains as a smooth curve over
-the modes. Double exponential smoothing (:class:`DoubleExponentialSmoother`) removes the lag of the memory.
+(:class:`~escape_hw.calibration.docrime.regression.ForgettingSums`), start from the last estimate, and have
+the unknowns of a full fit: gain, registration, random effects, and on a pyramid the optical gains as a
+smooth curve over the modes. Double exponential smoothing (:class:`DoubleExponentialSmoother`) removes the
+lag of the memory.
 """
 
 from __future__ import annotations
