@@ -132,7 +132,7 @@ def test_docrime_sees_the_same_modes_through_turbulence_but_weaker(
     assert np.median(found.correlation) > 0.9
     assert 0.15 < np.median(found.gain_ratio) < 0.6
     assert measured.response is not None
-    assert 1.5 < measured.response.delay < 2.6
+    assert 1.5 < measured.response.delay_frames < 2.6
 
 
 def test_loop_closes_with_either_matrix(

@@ -29,3 +29,9 @@ def test_a_metric_of_a_matrix():
         assert matrix.metrics["shortened"] == 3
     with pytest.raises(KeyError):
         matrix.metrics["unknown"]
+
+
+def test_the_delay():
+    response = fake.calibration().response
+    with pytest.warns(DeprecationWarning, match=r"TemporalResponse.delay is called"):
+        assert response.delay == response.delay_frames

@@ -303,7 +303,7 @@ def test_the_temporal_response_is_drawn_in_percent():
     response = fake.calibration("docrime").response
     axes = figures_bench.temporal_response(response).axes[0]
     assert [bar.get_height() for bar in axes.patches] == pytest.approx(list(100 * response.weights))
-    assert f"{response.delay:.2f} frames" in axes.get_title()
+    assert f"{response.delay_frames:.2f} frames" in axes.get_title()
 
 
 def test_psfs_are_drawn_without_their_background():

@@ -258,7 +258,7 @@ class _AotWriter:
             uid=LOOP,
             closed=self.telemetry is not None,
             framerate=self.facts.frame_rate_hz,
-            delay=None if response is None else float(response.delay),
+            delay=None if response is None else float(response.delay_frames),
             modes_to_measurements=self.image("MATRIX", _to_cube(matrix.data), matrix.slope_unit),
             **shared,
         )

@@ -289,7 +289,7 @@ def temporal_response(response: TemporalResponse) -> Figure:
     style.style_axes(axes).set(xlabel="frames after the command", ylabel="share of the response [%]")
     axes.axhline(0.0, color=style.MUTED, lw=0.7)
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    axes.set_title(f"mean delay {response.delay:.2f} frames", fontsize=9.5)
+    axes.set_title(f"mean delay {response.delay_frames:.2f} frames", fontsize=9.5)
     return figure
 
 
