@@ -161,6 +161,15 @@ class CommandContext:
         self._document = document
         self.code = self.code or (DONE if met else FAILED)
 
+    def report(self, met: bool = True, **content: Any) -> None:
+        """Set the document of a command without a run: its header, and this content.
+
+        The header has system, mode and seed as loaded, unless ``content`` has others.
+        """
+        from escape_hw.io.documents import header_fields
+
+        self.result({**header_fields(self.command, **self._subject), **content}, met)
+
     def load_config(self, selection: SystemSelection) -> SystemConfig:
         """The configuration of the selected system; its name, mode and seed then appear in error documents.
 
@@ -336,17 +345,10 @@ class CommandContext:
         self.notify(f"{'aborted' if code == ABORTED else 'error'}: {message}")
         for note in getattr(error, "__notes__", ()):
             self.notify(f"  {note}")
-        document = dict(self._document or self._error_document())
-        document["error"] = {"type": kind, "message": message}
-        self._document = document
+        if self._document is None:
+            self.report(**({} if self.folder is None else self.folder.location_fields()))
+        self._document = {**(self._document or {}), "error": {"type": kind, "message": message}}
         return code
-
-    def _error_document(self) -> dict[str, Any]:
-        """Document of a command without a result."""
-        from escape_hw.io.documents import header_fields
-
-        known = header_fields(self.command, **self._subject)
-        return known if self.folder is None else {**known, **self.folder.location_fields()}
 
     def _classify_error(self, error: BaseException) -> tuple[int, str, str]:
         if isinstance(error, KeyboardInterrupt):

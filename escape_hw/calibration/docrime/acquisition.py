@@ -116,7 +116,7 @@ class OpenLoopAcquisition:
                     is_due = self.monitor is not None and self.monitor.is_due(self.n_processed)
                     if is_due and (yield from self._check_progress()):
                         return False
-                    if report.due():
+                    if report.is_due():
                         yield report(done + 1, self._preview_arrays(preview), shortened=float(self.shortened))
             except Aborted:
                 yield from self._check_progress(final=True)

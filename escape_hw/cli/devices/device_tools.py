@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 from escape_hw.cli.context import CommandContext
 from escape_hw.cli.options import SystemSelection
@@ -37,16 +37,6 @@ def open_device(context: CommandContext, device: D) -> Iterator[D]:
                 context.interrupts.begin_closing()
     finally:
         context.interrupts.end_closing()
-
-
-def report_device_result(
-    context: CommandContext, command: str, config: SystemConfig, simulated: bool, changed: bool, **rest: Any
-) -> None:
-    """Set the command's document."""
-    from escape_hw.io.documents import header_fields
-
-    start = header_fields(command, config.system.name, simulated, config.system.seed)
-    context.result({**start, "changed": changed, **rest})
 
 
 def build_single_device(

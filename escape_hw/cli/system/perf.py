@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
 
-from escape_hw.cli.context import command_context
+from escape_hw.cli.command import command
+from escape_hw.cli.context import CommandContext
 from escape_hw.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -159,11 +160,12 @@ def document(rows: Sequence[BenchmarkRow]) -> dict[str, Any]:
     }
 
 
+@command("perf")
 def perf(
+    context: CommandContext,
     stages: Annotated[
         list[str] | None, typer.Argument(metavar="[STAGE]...", help="Stages to measure; all by default.")
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document.")] = False,
     page: Annotated[
         Path | None,
         typer.Option(
@@ -172,14 +174,13 @@ def perf(
     ] = None,
 ) -> None:
     """Benchmark speed and accuracy beside OOPAO and pyRTC, on one thread each."""
-    with command_context("perf", json=as_json) as context:
-        if page is not None:
-            require_page(page)
-        rows = run_benchmarks(stages or ())
-        if page is not None:
-            write_page(page, rows, measurement_conditions())
-        context.show(_table(rows))
-        context.result(document(rows))
+    if page is not None:
+        require_page(page)
+    rows = run_benchmarks(stages or ())
+    if page is not None:
+        write_page(page, rows, measurement_conditions())
+    context.show(_table(rows))
+    context.result(document(rows))
 
 
 def _table(rows: Sequence[BenchmarkRow]) -> Table:

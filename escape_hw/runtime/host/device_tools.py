@@ -157,7 +157,7 @@ def run_wave(
             sent = dm.send(flat + (shape(frequency_hz * at) - flat) * min(1.0, at / RISE_S))
             commands, skipped = commands + 1, skipped + sent.skipped
             peak = max(peak, float(np.abs(sent.sent).max()))
-            if report.due():
+            if report.is_due():
                 yield report(int(at), commands=commands)
             time.sleep(max(0.0, started + commands / WAVE_HZ - time.monotonic()))
         return DriveResult(commands, skipped, peak)
@@ -171,7 +171,7 @@ def grab_frames(camera: Camera, frames: int, timeout_s: float) -> Procedure[list
     found: list[Frame] = []
     for number in range(1, frames + 1):
         found.append(camera.next_frame(timeout_s))
-        if report.due():
+        if report.is_due():
             yield report(number)
     camera.stop()
     return found
@@ -188,7 +188,7 @@ def monitor_camera(camera: Camera, seconds: float, timeout_s: float) -> Procedur
         total += float(frame.data.mean())
         lowest, highest = min(lowest, int(frame.data.min())), max(highest, int(frame.data.max()))
         saturated = max(saturated, frame.n_saturated)
-        if report.due():
+        if report.is_due():
             yield report(int((last_ns - first_ns) * 1e-9), frames=frames, highest=highest)
     status = camera.status()
     camera.stop()

@@ -127,7 +127,7 @@ def _run_in_parallel(
             for future in completed:
                 # An error ends the sweep: the same trial would raise it again.
                 future.result()
-            if report.due():
+            if report.is_due():
                 yield report(n_before + len(plan) - n_unfinished)
     except BaseException:
         study.stop()
