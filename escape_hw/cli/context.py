@@ -27,7 +27,6 @@ from escape_hw.runtime.procedures.declaration import ComputedProcedure
 
 if TYPE_CHECKING:
     from escape_hw.api.procedure import Procedure
-    from escape_hw.cli.calibration.display import Display
     from escape_hw.cli.options import SystemSelection
     from escape_hw.config.system import SystemConfig
     from escape_hw.io.run_folder import RunFolder
@@ -234,7 +233,6 @@ class CommandContext:
         procedure: ProcedureSpec[T],
         selection: SystemSelection,
         out: Path | None,
-        display: Display,
         resumed_run: Path | None = None,
     ) -> None:
         """Run a procedure on the selected system, save its result and print it.
@@ -247,8 +245,6 @@ class CommandContext:
             The system.
         out
             Run folder; a dated one by default.
-        display
-            Prints the result.
         resumed_run
             Folder of the run that is continued.
 
@@ -257,6 +253,8 @@ class CommandContext:
         Aborted
             The result is partial; it was saved and printed.
         """
+        from escape_hw.cli.calibration.display import show_result
+
         selection = selection.with_overrides(*procedure.overrides)
         config = self.load_config(selection)
         procedure.load(config)
@@ -267,7 +265,7 @@ class CommandContext:
                 result = self.run(procedure.compute())
                 saved = procedure.save_computed(folder, result, self.wall_seconds)
                 self.result(saved.document, met=saved.met)
-                display(self, result, config.simulated, saved.document)
+                show_result(self, procedure.name, result, saved.document["simulated"], saved.document)
                 return
             with self.bench(selection) as bench:
                 from escape_hw.runtime.session.record import BenchRecord
@@ -277,7 +275,7 @@ class CommandContext:
             with self.protect_saving(stop):
                 saved = procedure.save(folder, record, result, self.wall_seconds)
                 self.result(saved.document, met=saved.met)
-                display(self, result, record.simulated, saved.document)
+                show_result(self, procedure.name, result, record.simulated, saved.document)
             if stop is not None:
                 raise stop
             procedure.finish()

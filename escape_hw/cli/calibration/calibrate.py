@@ -10,7 +10,6 @@ from typing import Annotated, Any
 import typer
 
 from escape_hw.cli import options
-from escape_hw.cli.calibration.display import show_calibration
 from escape_hw.cli.calibration.procedure_command import (
     option_name,
     procedure_options,
@@ -59,7 +58,7 @@ def _calibrate(
     if modes is not None:
         selection = _with_modes(context, selection, modes)
     try:
-        context.run_procedure(request, selection, out, show_calibration, request.resume)
+        context.run_procedure(request, selection, out, request.resume)
     except (EscapeError, KeyboardInterrupt) as error:
         _suggest_resume(context, error, request)
         raise

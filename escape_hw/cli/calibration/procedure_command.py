@@ -11,7 +11,6 @@ from typing import Annotated, Any
 import typer
 
 from escape_hw.cli import options
-from escape_hw.cli.calibration.display import display_function
 from escape_hw.cli.command import Command, build_command, keyword
 from escape_hw.cli.context import CommandContext
 from escape_hw.runtime.procedures.declaration import Parameter, ProcedureSpec
@@ -73,8 +72,7 @@ def procedure_command(procedure: type[ProcedureSpec[Any]]) -> Command:
     def run(
         context: CommandContext, selection: options.SystemSelection, out: Path | None, **arguments: Any
     ) -> None:
-        request = procedure.from_arguments(arguments, option_name)
-        context.run_procedure(request, selection, out, display_function(procedure.name))
+        context.run_procedure(procedure.from_arguments(arguments, option_name), selection, out)
 
     parameters = [
         keyword("selection", options.Selection),

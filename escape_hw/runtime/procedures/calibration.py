@@ -168,27 +168,22 @@ class CalibrationProcedure(ProcedureSpec["CalibrationResult"]):
     ) -> SavedRun:
         """Save the matrix, the measured matrix behind a pseudo-synthetic one, and the report."""
         from escape_hw.io.documents import calibration_document
-        from escape_hw.runtime.procedures.products import add_calibration, write_run_result
+        from escape_hw.runtime.procedures.products import add_result, save_run
 
         measured = measured_calibration(result)
         labels: dict[str, Any] = {"im": {"measured": "DO-CRIME", "column": ""}}
-        parents = {} if self._control_matrix is None else {"closing": self._control_matrix.path}
+        parents = () if self._control_matrix is None else (self._control_matrix.path,)
         if measured is not None:
-            parents = {"docrime": add_calibration(folder, record, "docrime", measured, parents)}
+            parents = (add_result(folder, record, "docrime", measured, *parents),)
             labels["docrime"] = {"label": "DO-CRIME"}
-        add_calibration(folder, record, "im", result, parents)
+        add_result(folder, record, "im", result, *parents)
         checks = self._criteria(result)
-        document = write_run_result(
-            folder,
-            {
-                **record.header_fields("calibrate"),
-                "title": f"Calibration of {record.system}",
-                **calibration_document(result),
-                "criteria": checks,
-                "labels": labels,
-                **record.footer_fields(wall_seconds),
-            },
-        )
+        document = save_run(
+            folder, record, "calibrate", f"Calibration of {record.system}", wall_seconds,
+            **calibration_document(result),
+            criteria=checks,
+            labels=labels,
+        )  # fmt: skip
         return SavedRun(document, all(entry["met"] for entry in checks))
 
     def _criteria(self, result: CalibrationResult) -> list[dict[str, Any]]:

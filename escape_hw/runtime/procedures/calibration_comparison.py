@@ -14,7 +14,7 @@ from escape_hw.api.procedure import Procedure
 from escape_hw.api.representation import short_repr
 from escape_hw.api.results import CalibrationResult, LoopResult
 from escape_hw.bench import Bench
-from escape_hw.runtime.procedures.calibration import calibrate_with_method
+from escape_hw.runtime.procedures.calibration import calibrate_with_method, measured_calibration
 from escape_hw.runtime.procedures.model_psf import model_psf
 
 #: Suffix of a matrix's label when the matrix is scaled by its optical gains.
@@ -43,13 +43,6 @@ class CalibrationComparison:
     notes: list[str] = field(default_factory=list)
     partial: bool = False
     __repr__ = short_repr
-
-
-def measured_calibration(result: CalibrationResult) -> CalibrationResult | None:
-    """The DO-CRIME matrix behind an ESCAPE matrix as a calibration of its own."""
-    if result.measured is None:
-        return None
-    return replace(result, matrix=result.measured, measured=None, registration=None, notes=())
 
 
 def measure_matrices(

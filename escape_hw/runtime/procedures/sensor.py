@@ -39,10 +39,10 @@ class SensorProcedure(ProcedureSpec["SensorSetup"]):
         from escape_hw.runtime.procedures.products import save_values
 
         grid = result.grid
-        values = {
-            "n_sub_apertures": grid.n_valid,
-            "counts": grid.counts,
-            "background": grid.background,
-        }
         title = f"Sensor of {record.system}"
-        return save_values(folder, record, self.name, title, values, wall_seconds)
+        return save_values(
+            folder, record, self.name, title, wall_seconds,
+            n_sub_apertures=grid.n_valid,
+            counts=grid.counts,
+            background=grid.background,
+        )  # fmt: skip

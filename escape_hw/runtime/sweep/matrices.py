@@ -22,7 +22,7 @@ from escape_hw.runtime.procedures.calibration_comparison import (
     measure_optical_gains,
     with_and_without_optical_gains,
 )
-from escape_hw.runtime.procedures.products import add_calibration, add_gains, product_key
+from escape_hw.runtime.procedures.products import add_result, product_key
 from escape_hw.runtime.session.record import BenchRecord
 from escape_hw.runtime.sweep.design import MatrixVariant
 
@@ -68,10 +68,10 @@ def save_variants(
     saved: dict[str, Path] = {}
     for label, calibration in calibrations.items():
         parent = saved.get(label.removesuffix(WITH_GAINS))
-        source = {} if parent is None else {"im": parent}
-        saved[label] = add_calibration(folder, record, product_key(label), calibration, source)
+        source = [] if parent is None else [parent]
+        saved[label] = add_result(folder, record, product_key(label), calibration, *source)
     if measured.gains is not None:
-        add_gains(folder, record, "gains", measured.gains, {"im": saved["ESCAPE"]})
+        add_result(folder, record, "gains", measured.gains, saved["ESCAPE"])
     return [_make_variant(label, path) for label, path in saved.items()]
 
 
