@@ -40,11 +40,7 @@ class InterruptHandler:
     While a procedure runs, the first signal sets ``abort`` and the second raises ``KeyboardInterrupt``.
     While the devices are being closed or an aborted run is saved, signals are ignored, so that the mirror
     is flattened and the data are written. At any other time a signal raises ``KeyboardInterrupt``.
-
-    Parameters
-    ----------
-    notify
-        Called with a line for the operator, from the signal handler.
+    ``notify`` is called with a line for the operator, from the signal handler.
     """
 
     def __init__(self, notify: Callable[[str], None]) -> None:
@@ -235,18 +231,9 @@ class CommandContext:
         out: Path | None,
         resumed_run: Path | None = None,
     ) -> None:
-        """Run a procedure on the selected system, save its result and print it.
+        """Run a requested procedure on the selected system, save its result and print it.
 
-        Parameters
-        ----------
-        procedure
-            The request.
-        selection
-            The system.
-        out
-            Run folder; a dated one by default.
-        resumed_run
-            Folder of the run that is continued.
+        Products go to ``out``, by default a dated folder; the folder of a continued run is not changed.
 
         Raises
         ------

@@ -211,17 +211,7 @@ class MirrorConfig(DeviceConfig):
         return actuator_layouts.positions(self.layout)
 
     def info(self, model: str, *, simulated: bool, serial: str = "") -> DMInfo:
-        """Identity and nominal geometry for a driver or twin.
-
-        Parameters
-        ----------
-        model
-            Model of the device.
-        simulated
-            Whether it is a twin.
-        serial
-            Serial number read from the device; by default as configured.
-        """
+        """Identity and nominal geometry for a driver or twin; ``serial`` is by default as configured."""
         positions_m = self.positions() * self.pitch_m
         return DMInfo(
             model,

@@ -22,16 +22,9 @@ T = TypeVar("T")
 
 
 def require_factory(what: str, where: str, factory: object, parameters: Sequence[str]) -> None:
-    """Check that an object can be called as a factory.
+    """Check that an object can be called as a factory with positional arguments of these names.
 
-    Parameters
-    ----------
-    what, where
-        Description and location of the object, for the message.
-    factory
-        The object.
-    parameters
-        Names of the positional arguments.
+    ``what`` and ``where`` describe the object in the message.
 
     Raises
     ------
@@ -58,16 +51,7 @@ def require_factory(what: str, where: str, factory: object, parameters: Sequence
 
 
 def call_factory(what: str, kind: type[T], factory: Callable[..., object], *arguments: Any) -> T:
-    """Call a factory and check the type of its result.
-
-    Parameters
-    ----------
-    what
-        Description of the factory, for the message.
-    kind
-        Required type of the result.
-    factory, arguments
-        The factory and its arguments.
+    """Call a factory and check the type of its result; ``what`` describes it in messages.
 
     Raises
     ------
@@ -168,14 +152,7 @@ def available(group: str) -> tuple[str, ...]:
 
 
 def device_factory(name: str, *, hardware: bool = False) -> DeviceFactory:
-    """The factory of a driver or twin.
-
-    Parameters
-    ----------
-    name
-        Name of the driver or twin.
-    hardware
-        Whether a driver for real hardware is required; the message then suggests no twins.
+    """The factory of a driver or twin; with ``hardware``, messages suggest no twins.
 
     Raises
     ------

@@ -122,12 +122,7 @@ def find_benchmarks() -> dict[str, EntryPoint]:
 
 
 def run_benchmarks(stages: Sequence[str] = ()) -> list[BenchmarkRow]:
-    """Run benchmark stages.
-
-    Parameters
-    ----------
-    stages
-        Names; all of them by default.
+    """Run the named benchmark stages, all of them by default.
 
     Raises
     ------

@@ -32,20 +32,10 @@ class DriveResult:
 
 @dataclass(frozen=True, slots=True)
 class CameraStatistics:
-    """Statistics of a camera's frames.
+    """Statistics of a camera's frames: number, the camera's own counters, rate by the times of exposure.
 
-    Parameters
-    ----------
-    frames
-        Frames delivered.
-    status
-        The camera's own counters.
-    rate_hz
-        From the frames' times of exposure.
-    mean, lowest, highest
-        Counts over all pixels and frames.
-    saturated
-        Saturated pixels of the worst frame.
+    ``mean``, ``lowest`` and ``highest`` are counts over all pixels and frames; ``saturated`` is the number of
+    saturated pixels in the worst frame.
     """
 
     frames: int
@@ -79,17 +69,7 @@ def poke_shape(dm: DeformableMirror, actuator: int, amplitude: float) -> NDArray
 
 
 def hold_shape(dm: DeformableMirror, shape: NDArray[np.float64], seconds: float) -> Procedure[DriveResult]:
-    """Hold a shape for a while, then flatten.
-
-    Parameters
-    ----------
-    dm
-        An open mirror.
-    shape
-        ``(n_act,)``, fractions of full stroke.
-    seconds
-        Duration by the wall clock.
-    """
+    """Hold a shape ``(n_act,)``, fractions of full stroke, for a while by the wall clock, then flatten."""
     report = Reporter("holding the shape", max(1, math.ceil(seconds)), "second")
     try:
         sent = dm.send(shape)
@@ -134,19 +114,7 @@ def wave_generator(
 def run_wave(
     dm: DeformableMirror, shape: Callable[[float], NDArray[np.float64]], frequency_hz: float, seconds: float
 ) -> Procedure[DriveResult]:
-    """Run a wave over the mirror, with a slow rise, then flatten.
-
-    Parameters
-    ----------
-    dm
-        An open mirror.
-    shape
-        From :func:`wave_generator`.
-    frequency_hz
-        Periods per second.
-    seconds
-        Duration by the wall clock.
-    """
+    """Run a wave from :func:`wave_generator` over an open mirror, with a slow rise, then flatten."""
     report = Reporter("wave", max(1, math.ceil(seconds)), "second")
     commands = skipped = 0
     peak = 0.0

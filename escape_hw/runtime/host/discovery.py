@@ -28,12 +28,7 @@ _ALPAO_VARIABLES = ("ACECFG", "ACEROOT")
 def discover(hosts: Sequence[str] = (), host: Host | None = None) -> list[DiscoveredDevice]:
     """Devices on USB, on serial lines, with ALPAO files, and those that drivers find on the given hosts.
 
-    Parameters
-    ----------
-    hosts
-        Network hosts to query, ``name`` or ``name:port``; the network is never scanned.
-    host
-        The computer; this one by default.
+    ``hosts`` are queried as ``name`` or ``name:port``; the network is never scanned.
     """
     host = host or Host()
     found = [*_find_usb(host), *_find_serial(host), *_find_alpao(host)]

@@ -398,26 +398,12 @@ def calibrate_with_method(
     until: Target | None = None,
     checkpoint: Checkpoint | None = None,
 ) -> Procedure[CalibrationResult]:
-    """Calibrate with the method of that name.
+    """Calibrate with one of :data:`METHODS`; during push-pull a movable phase screen is out of the beam.
 
-    During push-pull the phase screen, if the bench can move it, is out of the beam.
-
-    Parameters
-    ----------
-    bench
-        An open bench.
-    method
-        One of :data:`METHODS`.
-    frames, poke, whiten, estimator
-        See the parameters of the procedure, for example :class:`EscapeProcedure`.
-    grid
-        Geometry of the sensor; found on frames by default.
-    closed_loop
-        Calibration whose matrix closes the loop during the measurement; methods of :data:`CLOSED_LOOP`.
-    until
-        Stop when this target is reached.
-    checkpoint
-        File for the state of the run, and the state to resume from.
+    ``frames``, ``poke``, ``whiten`` and ``estimator`` are parameters of the procedures, see for example
+    :class:`EscapeProcedure`. The matrix of ``closed_loop`` closes the loop during the measurement, with a
+    method of :data:`CLOSED_LOOP`. The sensor geometry ``grid`` is found on frames by default, ``until`` ends
+    the run at a target, ``checkpoint`` is the file for its state and the state to resume from.
 
     Raises
     ------

@@ -48,19 +48,11 @@ class CalibrationComparison:
 def measure_matrices(
     bench: Bench, frames: int, result: CalibrationComparison, *, common_geometry: bool = False
 ) -> Procedure[None]:
-    """Add the calibrations "push-pull", "DO-CRIME" and "ESCAPE", the latter two from the same frames.
+    """Add the calibrations "push-pull", "DO-CRIME" and "ESCAPE", the latter two from the same ``frames``.
 
-    Parameters
-    ----------
-    bench
-        An open bench.
-    frames
-        Frames of the DO-CRIME measurement.
-    result
-        Takes the calibrations; ``partial`` is set when one of them was stopped.
-    common_geometry
-        Measure push-pull last, with the sensor geometry of ESCAPE, so that the matrices differ in nothing
-        else; otherwise first, with a geometry of its own.
+    With ``common_geometry``, push-pull is measured last, with the sensor geometry of ESCAPE, so that the
+    matrices differ in nothing else; otherwise first, with a geometry of its own. ``result.partial`` is set
+    when one of them was stopped.
     """
     if not common_geometry:
         baseline = yield from calibrate_with_method(bench, "push-pull")
@@ -87,16 +79,8 @@ def measure_optical_gains(
 ) -> Procedure[tuple[CalibrationResult, NDArray[np.float32]]]:
     """Add the optical gains of all matrices, measured in closed loop with ESCAPE's.
 
-    Parameters
-    ----------
-    bench
-        An open bench with a science camera.
-    frames
-        Frames per round at most.
-    result
-        With the matrices; takes the gains, and ``partial`` when the measurement was stopped.
-    accuracy
-        Relative standard error of the gains at which the measurement stops.
+    A round takes at most ``frames``; the measurement ends at the relative standard error ``accuracy``.
+    ``result.partial`` is set when it was stopped. The bench needs a science camera.
 
     Returns
     -------
@@ -147,22 +131,9 @@ def close_loop_at_best_gain(
     model: NDArray[np.float32],
     result: CalibrationComparison,
 ) -> Procedure[None]:
-    """Search a matrix's own best gain, close the loop with it, and add both to the result.
+    """Search a matrix's own best gain, close the loop with it, and add both runs to the result.
 
-    Parameters
-    ----------
-    bench
-        An open bench with a science camera.
-    label
-        Name of the matrix in the result.
-    calibration
-        The matrix and its sensor geometry.
-    loop_frames
-        Frames of the loop at the best gain.
-    model
-        PSF to measure Strehl ratios against.
-    result
-        Takes the runs; ``partial`` is set when one of them was stopped.
+    Strehl ratios are measured against ``model``. ``result.partial`` is set when a run was stopped.
 
     Raises
     ------

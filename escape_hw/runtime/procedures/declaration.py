@@ -81,12 +81,7 @@ class Parameter:
     def check(self, value: Any, label: str = "") -> Any:
         """The value, converted to the type of the parameter; ``None`` if the parameter is absent.
 
-        Parameters
-        ----------
-        value
-            The value as given.
-        label
-            Name of the parameter for messages (default: ``name``).
+        Messages call the parameter ``label``, by default its name.
 
         Raises
         ------
@@ -195,15 +190,7 @@ def parameter(
 
 @dataclass(frozen=True, slots=True)
 class SavedRun:
-    """A saved result.
-
-    Parameters
-    ----------
-    document
-        Content of ``result.json``, with absolute paths of the products.
-    met
-        Whether the run met its own criteria.
-    """
+    """Content of ``result.json``, with absolute paths, and whether the run met its own criteria."""
 
     document: dict[str, Any] = field(default_factory=dict)
     met: bool = True
@@ -257,14 +244,7 @@ class ProcedureSpec(ABC, Generic[ResultT]):
 
     @classmethod
     def from_arguments(cls, arguments: Mapping[str, Any], label: Callable[[str], str] = str) -> Self:
-        """A request from arguments by name; ``None`` stands for absent, names of earlier versions count.
-
-        Parameters
-        ----------
-        arguments
-            Values by name.
-        label
-            Spelling of a parameter's name in messages.
+        """A request from arguments by name; see :func:`check_arguments`.
 
         Raises
         ------
@@ -311,12 +291,7 @@ class ProcedureSpec(ABC, Generic[ResultT]):
     def load(self, config: SystemConfig, simulated: bool = False) -> None:
         """Read the files that the run needs, before any device is opened.
 
-        Parameters
-        ----------
-        config
-            The system's configuration.
-        simulated
-            The devices are open already and simulated, whatever the configured mode is.
+        ``simulated``: the devices are open already and simulated, whatever the configured mode is.
 
         Raises
         ------
@@ -328,14 +303,9 @@ class ProcedureSpec(ABC, Generic[ResultT]):
 
     @abstractmethod
     def procedure(self, bench: Bench, folder: RunFolder | None) -> Procedure[ResultT]:
-        """The generator that does the work.
+        """The generator that does the work, on an open bench with the configuration given to :meth:`load`.
 
-        Parameters
-        ----------
-        bench
-            An open bench with the configuration given to :meth:`load`.
-        folder
-            Folder for intermediate files; ``None``: the run leaves none.
+        Intermediate files go to ``folder``; without one the run leaves none.
 
         Raises
         ------
@@ -425,14 +395,8 @@ def check_arguments(
 ) -> dict[str, Any]:
     """A value for every parameter: the one given, or the default.
 
-    Parameters
-    ----------
-    parameters
-        The declared parameters.
-    arguments
-        Values by name, also by names of earlier versions; ``None`` stands for absent.
-    label
-        Spelling of a parameter's name in messages.
+    Arguments may have names of earlier versions; ``None`` stands for absent. ``label`` spells the name of a
+    parameter for messages.
 
     Raises
     ------

@@ -112,15 +112,7 @@ class TrackProcedure(MatrixProcedure["TrackResult"]):
 
 @dataclass(frozen=True, slots=True)
 class InjectedRegistration:
-    """Injected registration of a twin over time; for reports only.
-
-    Parameters
-    ----------
-    start
-        Registration at time zero of the twin's clock.
-    drift
-        Change with time.
-    """
+    """Injected registration of a twin over time, from its start by the drift; for reports only."""
 
     start: Registration
     drift: TwinDrift

@@ -30,15 +30,8 @@ from escape_hw.runtime.sweep.design import MatrixVariant
 def measure_variants(bench: Bench, *, frames: int, gain_frames: int = 0) -> Procedure[CalibrationComparison]:
     """Measure the push-pull, DO-CRIME and ESCAPE matrices, and their optical gains.
 
-    Parameters
-    ----------
-    bench
-        An open bench.
-    frames
-        Frames of the DO-CRIME measurement.
-    gain_frames
-        Frames per round of the optical gains at most. 0: none are measured, as for a Shack-Hartmann
-        sensor, whose optical gains are close to one.
+    ``gain_frames`` are frames per round of the optical gains at most. 0: none are measured, as for a
+    Shack-Hartmann sensor, whose optical gains are close to one.
 
     Raises
     ------
@@ -78,16 +71,9 @@ def save_variants(
 def read_variants(
     products: Sequence[MatrixProduct], gains: GainsResult | None, folder: Path
 ) -> list[MatrixVariant]:
-    """Variants from files.
+    """Variants from files; several matrices of the same kind are named by their files.
 
-    Parameters
-    ----------
-    products
-        The matrices. Several of the same kind are named by their files.
-    gains
-        Optical gains from ``escape gains``: every matrix that has some is also compared scaled by them.
-    folder
-        Folder for the scaled matrices.
+    Every matrix that has optical gains is also compared scaled by them, and then saved in the folder.
 
     Raises
     ------

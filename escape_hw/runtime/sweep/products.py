@@ -120,14 +120,9 @@ def save_sweep(
     result: SweepResult,
     wall_seconds: float,
 ) -> dict[str, Any]:
-    """Save the description, the table of all loops, ``result.json`` and the report of a sweep.
+    """Save description, table of loops, ``result.json`` and report of a sweep; returns the document.
 
     The sweep can also be resumed from this folder: its description names the same study.
-
-    Returns
-    -------
-    dict
-        The run's document; its ``criteria`` say which were met.
 
     Raises
     ------
@@ -144,22 +139,10 @@ def save_sweep(
 
 
 def find_finished_result(run: Path, description: SweepDescription) -> dict[str, Any] | None:
-    """The result of a finished sweep, from its own folder or from the one it was resumed in.
+    """The result of a finished sweep with its folder, which may be the one it was resumed in.
 
-    A missing report is built again.
-
-    Parameters
-    ----------
-    run
-        Folder of the sweep to resume.
-    description
-        Its description.
-
-    Returns
-    -------
-    dict or None
-        Its ``result.json`` with the folder; ``None`` when loops are left to run, or the folder of the
-        result was removed.
+    ``None`` when loops are left to run, or the folder of the result was removed. A missing report is built
+    again.
 
     Raises
     ------

@@ -45,12 +45,7 @@ def require_optuna() -> None:
 def parse_search_space(config: SystemConfig, texts: Sequence[str]) -> tuple[Parameter, ...]:
     """The search space; on hardware, only the loop's parameters within given limits.
 
-    Parameters
-    ----------
-    config
-        Of the system.
-    texts
-        See :func:`~escape_hw.runtime.sweep.search_space.parse_parameter`.
+    For the texts see :func:`~escape_hw.runtime.sweep.search_space.parse_parameter`.
 
     Raises
     ------

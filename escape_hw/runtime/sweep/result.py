@@ -32,14 +32,8 @@ DEFAULT_MARGIN = 0.01
 class BestLoops:
     """A variant at its own best parameters.
 
-    Parameters
-    ----------
-    values
-        The parameters.
-    strehl
-        Mean over the realisations of the last stage, with its standard error over them.
-    closed, loops
-        Loops that stayed closed, and all.
+    ``strehl`` is the mean over the realisations of the last stage, with its standard error over them; of the
+    ``loops``, ``closed`` stayed closed.
     """
 
     values: dict[str, Any]
@@ -102,12 +96,7 @@ class SweepResult:
 def analyse_sweep(sweep: Sweep, run: SweepRun, margin: float = DEFAULT_MARGIN) -> SweepResult:
     """Best parameters, comparisons and importances from the loops of a sweep.
 
-    Parameters
-    ----------
-    sweep, run
-        The sweep and its loops.
-    margin
-        Largest difference in the Strehl ratio that counts as equivalent.
+    ``margin`` is the largest difference in the Strehl ratio that counts as equivalent.
     """
     best = {}
     for variant in sweep.variants:
@@ -168,14 +157,8 @@ def importances(
 ) -> dict[str, float]:
     """Share of each parameter in the variance of the Strehl ratio (fANOVA, Hutter et al. 2014, by Optuna).
 
-    The matrix counts as a parameter (paper, validation procedure).
-
-    Parameters
-    ----------
-    sweep, records
-        The sweep and its finished loops; those of the first stage are used.
-    closed_only
-        Leave out the loops that diverged; otherwise they count with a Strehl ratio of 0.
+    The matrix counts as a parameter (paper, validation procedure). The loops of the first stage are used;
+    those that diverged count with a Strehl ratio of 0, or are left out (``closed_only``).
 
     Returns
     -------

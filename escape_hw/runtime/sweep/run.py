@@ -43,19 +43,9 @@ class SweepRun:
 
 
 def run_sweep(study: SweepStudy, runner: Workers | Bench) -> Procedure[SweepRun]:
-    """Run the unfinished loops of a sweep.
+    """Run the unfinished loops of a sweep: with workers in parallel, or on an open bench one after the other.
 
-    Parameters
-    ----------
-    study
-        Of the sweep; its finished trials do not run again.
-    runner
-        Workers that open simulated benches, or an open bench, on which the loops run one after the other.
-
-    Returns
-    -------
-    SweepRun
-        ``partial`` when the operator stopped it; loops finished by then are in the study.
+    ``partial`` of the result is true when the operator stopped it; loops finished by then are in the study.
 
     Raises
     ------
@@ -191,22 +181,11 @@ def _candidates(sweep: Sweep, records: Sequence[TrialRecord]) -> dict[tuple[str,
 def shortlist(
     records: Sequence[TrialRecord], space: Sequence[Parameter], variant: str, count: int
 ) -> list[dict[str, Any]]:
-    """The parameters of the most promising loops of a variant's first stage, best first.
+    """Parameters of the ``count`` most promising loops of a variant's first stage, best first.
 
-    Loops are ranked by the mean merit of their nearest neighbours among the parameters, themselves
-    included: the Strehl ratio of a single loop also depends on its turbulence. Loops that diverged count
-    with 0.
-
-    Parameters
-    ----------
-    records
-        Finished loops.
-    space
-        What was varied.
-    variant
-        Label of the matrix variant.
-    count
-        How many; fewer where fewer loops stayed closed.
+    Fewer where fewer loops stayed closed. Loops are ranked by the mean merit of their nearest neighbours
+    among the parameters, themselves included: the Strehl ratio of a single loop also depends on its
+    turbulence. Loops that diverged count with 0.
     """
     own = [r for r in records if r.slot.stage == EXPLORE and r.slot.variant == variant]
     closed = [number for number, record in enumerate(own) if record.merit > 0]
