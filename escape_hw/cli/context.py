@@ -34,6 +34,9 @@ if TYPE_CHECKING:
     from escape_hw.runtime.session.system import System
 
 
+T = TypeVar("T")
+
+
 class InterruptHandler:
     """Turns SIGINT and SIGTERM into an orderly stop; does nothing outside the main thread.
 
@@ -74,13 +77,17 @@ class InterruptHandler:
         finally:
             self._in_procedure = False
 
-    def begin_closing(self) -> None:
-        """Ignore signals until :meth:`end_closing`."""
-        self._protected_activity = "the mirror is being flattened and the devices closed"
-
-    def end_closing(self) -> None:
-        """Handle signals again."""
-        self._protected_activity = ""
+    @contextmanager
+    def protect_closing(self, opened: AbstractContextManager[T]) -> Iterator[T]:
+        """Enter a device, system or server, and ignore signals while it is closed."""
+        try:
+            with opened as entered:
+                try:
+                    yield entered
+                finally:
+                    self._protected_activity = "the mirror is being flattened and the devices closed"
+        finally:
+            self._protected_activity = ""
 
     @contextmanager
     def protect_saving(self) -> Iterator[None]:
@@ -101,7 +108,6 @@ class InterruptHandler:
             raise KeyboardInterrupt
 
 
-T = TypeVar("T")
 log = logging.getLogger(__name__)
 
 _PIPE_WIDTH = 120
@@ -284,24 +290,18 @@ class CommandContext:
             folder.write_config(config.to_toml())
             yield folder
 
-    @contextmanager
-    def bench(self, selection: SystemSelection) -> Iterator[System]:
+    def bench(self, selection: SystemSelection) -> AbstractContextManager[System]:
         """The open system; finally the mirror is flattened and the devices are closed."""
         from escape_hw.runtime.session.system import open_system
 
         self._require_not_served(selection)
-        opened_system = open_system(
-            selection.system, set=selection.set, seed=selection.seed, mode=selection.mode
-        )
+        system = open_system(selection.system, set=selection.set, seed=selection.seed, mode=selection.mode)
+        return self.opened(system)
+
+    def opened(self, device: AbstractContextManager[T]) -> AbstractContextManager[T]:
+        """Open a device or system, and close it at the end; a Ctrl-C does not interrupt the closing."""
         self.devices_opened = True
-        try:
-            with opened_system as system:
-                try:
-                    yield system
-                finally:
-                    self.interrupts.begin_closing()
-        finally:
-            self.interrupts.end_closing()
+        return self.interrupts.protect_closing(device)
 
     def _require_not_served(self, selection: SystemSelection) -> None:
         """Refuse to open hardware that a server has opened.

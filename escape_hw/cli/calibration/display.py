@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from escape_hw.runtime.procedures.calibration import METHODS
 
@@ -13,37 +13,22 @@ if TYPE_CHECKING:
     from escape_hw.api.results import CalibrationResult, LoopResult
     from escape_hw.api.tracking import TrackResult
     from escape_hw.calibration.optical_gain.bootstrap import GainsRun
-
-
-class Terminal(Protocol):
-    """Where results are printed."""
-
-    def show(self, *items: RenderableType) -> None:
-        """Print results for people on standard output."""
+    from escape_hw.cli.context import CommandContext
 
 
 def show_result(
-    terminal: Terminal, procedure: str, result: object, simulated: bool, document: dict[str, Any]
+    context: CommandContext, procedure: str, result: object, simulated: bool, document: dict[str, Any]
 ) -> None:
     """Print the result of a procedure: its origin, its values, criteria and products.
 
-    Parameters
-    ----------
-    terminal
-        Where to print.
-    procedure
-        Name of the procedure; one without a table of its own prints criteria and products only.
-    result, document
-        The result, and the run's document.
-    simulated
-        Whether it was measured on a twin.
+    A procedure without a table of its own prints criteria and products only.
     """
     from escape_hw.cli.formatting import format_criteria, format_products, status_line
 
-    terminal.show(status_line(simulated, bool(document.get("partial"))))
+    context.show(status_line(simulated, bool(document.get("partial"))))
     if procedure in _VALUES:
-        terminal.show(*_VALUES[procedure](result, document))
-    terminal.show(*format_criteria(document.get("criteria", ())), *format_products(document["products"]))
+        context.show(*_VALUES[procedure](result, document))
+    context.show(*format_criteria(document.get("criteria", ())), *format_products(document["products"]))
 
 
 def _calibration(result: CalibrationResult, document: dict[str, Any]) -> Iterator[RenderableType]:

@@ -13,10 +13,10 @@ import typer
 from escape_hw.cli import options
 from escape_hw.cli.command import command
 from escape_hw.cli.context import CommandContext
+from escape_hw.errors import Aborted, ConfigError
 
 if TYPE_CHECKING:
     from escape_hw.bench import Bench
-    from escape_hw.errors import Aborted
     from escape_hw.io.run_folder import RunFolder
     from escape_hw.runtime.session.record import BenchRecord
     from escape_hw.runtime.sweep.description import SweepDescription
@@ -113,7 +113,6 @@ def sweep(
     out: options.Out = None,
 ) -> None:
     """Compare matrices, each at its own best gain, leak and number of modes, on the same turbulence."""
-    from escape_hw.errors import ConfigError
     from escape_hw.runtime.sweep.request import parse_search_space, require_loop_frames, require_optuna
 
     require_optuna()
@@ -194,7 +193,6 @@ def _describe(
 def _prepare_variants(
     context: CommandContext, request: _Request, bench: Bench, folder: RunFolder, record: BenchRecord
 ) -> list[MatrixVariant]:
-    from escape_hw.errors import ConfigError
     from escape_hw.io.fits.gains import load_gains
     from escape_hw.runtime.procedures.matrix_input import load_fitting_matrix, require_hardware_matrix
     from escape_hw.runtime.sweep.matrices import measure_variants, read_variants, save_variants

@@ -11,11 +11,8 @@ import typer
 from escape_hw.cli import options
 from escape_hw.cli.command import command
 from escape_hw.cli.context import CommandContext
-from escape_hw.cli.devices.device_tools import (
-    announce_change,
-    build_single_device,
-    open_device,
-)
+from escape_hw.cli.devices.device_tools import announce_change, build_single_device
+from escape_hw.errors import ConfigError
 
 if TYPE_CHECKING:
     from escape_hw.api.adaptive_secondary import AdaptiveSecondary, ShellHealth
@@ -62,8 +59,6 @@ def clear(
     yes: Annotated[bool, typer.Option("--yes", help="The cause is fixed; do not ask.")] = False,
 ) -> None:
     """Clear a latched fault after its cause is fixed; the shell is at rest afterwards."""
-    from escape_hw.errors import ConfigError
-
     config, mirror = _secondary(context, selection)
     context.devices_opened = True
     previous = after = mirror.observe_health()
@@ -73,7 +68,7 @@ def clear(
             raise ConfigError("the fault was not cleared; fix its cause, then confirm with --yes")
     if previous.state == "fault":
         announce_change(context, config, "dm", f"clear the fault '{previous.fault}'")
-        with open_device(context, mirror):
+        with context.opened(mirror):
             mirror.recover()
             after = mirror.health
     context.show(f"fault: {previous.fault or 'none'}; now {after.state}")
@@ -114,7 +109,7 @@ def _go_to_state(context: CommandContext, selection: options.SystemSelection, *,
     previous = mirror.observe_health().state
     announce_change(context, config, "dm", f"from {previous} to {requested}")
     mirror.leave_set = floating
-    with open_device(context, mirror):
+    with context.opened(mirror):
         mirror.go_to(requested)
         health = mirror.health
     context.show(f"{previous} → {health.state}", *_format_health(health))

@@ -11,11 +11,8 @@ import typer
 from escape_hw.cli import options
 from escape_hw.cli.command import command
 from escape_hw.cli.context import CommandContext
-from escape_hw.cli.devices.device_tools import (
-    announce_change,
-    build_single_device,
-    open_device,
-)
+from escape_hw.cli.devices.device_tools import announce_change, build_single_device
+from escape_hw.errors import ConfigError
 
 if TYPE_CHECKING:
     from escape_hw.api.camera import Camera, CameraInfo, CameraSettings, Frame
@@ -44,13 +41,12 @@ def snap(
     """Record frames with the settings of the configuration."""
     import numpy as np
 
-    from escape_hw.errors import ConfigError
     from escape_hw.runtime.host.device_tools import grab_frames
 
     config, section, device = _camera(context, selection, camera)
     if out is not None and out.exists():
         raise ConfigError(f"{out}: exists; choose another name or remove it")
-    with open_device(context, device):
+    with context.opened(device):
         settings, changed = _apply_configuration(context, config, camera, device)
         frame_list = context.run(grab_frames(device, frames, section.timeout_s))
         info, status = device.info, device.status()
@@ -92,7 +88,7 @@ def stream(
     from escape_hw.runtime.host.device_tools import monitor_camera
 
     config, section, device = _camera(context, selection, camera)
-    with open_device(context, device):
+    with context.opened(device):
         settings, changed = _apply_configuration(context, config, camera, device)
         statistics = context.run(monitor_camera(device, seconds, section.timeout_s))
         info = device.info
@@ -134,7 +130,7 @@ def settings(
     requested = _requested_settings(section.settings(), exposure, rate, gain, region)
     if not check:
         announce_change(context, config, camera, "exposure, frame rate, gain and region")
-    with open_device(context, device):
+    with context.opened(device):
         achievable = device.check(requested)
         now = achievable if check else device.configure(requested)
         info = device.info
@@ -183,7 +179,6 @@ def _requested_settings(
         The region is not four integers.
     """
     from escape_hw.api.camera import Region
-    from escape_hw.errors import ConfigError
 
     if region is not None:
         parts = region.split(",")

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import TYPE_CHECKING, TypeVar
 
 from escape_hw.cli.context import CommandContext
@@ -23,20 +21,6 @@ def announce_change(context: CommandContext, config: SystemConfig, key: str, wha
     section = getattr(config.devices, key)
     if resolve_mode(section, config) == "hardware":
         context.notify(f"this changes hardware, devices.{key} {section.serial}: {what}")
-
-
-@contextmanager
-def open_device(context: CommandContext, device: D) -> Iterator[D]:
-    """Open a device, and close it at the end; a Ctrl-C does not interrupt the closing."""
-    context.devices_opened = True
-    try:
-        with device:
-            try:
-                yield device
-            finally:
-                context.interrupts.begin_closing()
-    finally:
-        context.interrupts.end_closing()
 
 
 def build_single_device(

@@ -10,11 +10,8 @@ import typer
 from escape_hw.cli import options
 from escape_hw.cli.command import command
 from escape_hw.cli.context import CommandContext
-from escape_hw.cli.devices.device_tools import (
-    announce_change,
-    build_single_device,
-    open_device,
-)
+from escape_hw.cli.devices.device_tools import announce_change, build_single_device
+from escape_hw.errors import ConfigError
 
 if TYPE_CHECKING:
     from escape_hw.api.mirror import DeformableMirror
@@ -33,7 +30,7 @@ def flat(context: CommandContext, selection: options.Selection) -> None:
     config, dm = _mirror(context, selection)
     announce_change(context, config, "dm", "ramp to flat")
     _preserve_floating(dm)
-    with open_device(context, dm):
+    with context.opened(dm):
         dm.flatten()
         info, sent = dm.info, dm.sent_count
     context.show(f"{info.model} {info.serial}: flat after {sent} commands")
@@ -59,7 +56,7 @@ def poke(
         context, config, "dm", f"flat, then actuator {actuator} by {amplitude:g} for {seconds:g} s"
     )
     _preserve_floating(dm)
-    with open_device(context, dm):
+    with context.opened(dm):
         dm.flatten()
         motion = context.run(hold_shape(dm, poke_shape(dm, actuator, amplitude), seconds))
         info = dm.info
@@ -84,7 +81,7 @@ def wave(
     config, dm = _mirror(context, selection)
     announce_change(context, config, "dm", f"a wave of {amplitude:g} at {frequency:g} Hz for {seconds:g} s")
     _preserve_floating(dm)
-    with open_device(context, dm):
+    with context.opened(dm):
         dm.flatten()
         motion = context.run(run_wave(dm, wave_generator(dm, amplitude, waves), frequency, seconds))
         info = dm.info
@@ -113,7 +110,7 @@ def status(context: CommandContext, selection: options.Selection) -> None:
         context.show(f"{health.state}, gap {health.gap_m * 1e6:.1f} um {health.fault}".rstrip())
     else:
         announce_change(context, config, "dm", "it is opened, and flattened when it is closed")
-        with open_device(context, dm):
+        with context.opened(dm):
             changed = True
     info, limits = dm.info, dm.limits
     context.show(
@@ -156,8 +153,6 @@ def _require_actuator(config: SystemConfig, actuator: int, amplitude: float) -> 
     ConfigError
         The actuator does not exist or is disabled, or the poke exceeds the stroke.
     """
-    from escape_hw.errors import ConfigError
-
     section = config.devices.dm
     if actuator >= section.n_act:
         raise ConfigError(f"actuator {actuator}: does not exist; the mirror has 0 to {section.n_act - 1}")

@@ -9,6 +9,7 @@ import typer
 
 from escape_hw.cli.command import command
 from escape_hw.cli.context import CommandContext
+from escape_hw.errors import ConfigError
 
 if TYPE_CHECKING:
     from escape_hw.api.emulator import Emulator
@@ -52,8 +53,6 @@ def emulate(
 
 
 def _parse_option(text: str) -> tuple[str, str]:
-    from escape_hw.errors import ConfigError
-
     key, equals, value = text.partition("=")
     if not equals or not key:
         raise ConfigError(f"--option {text}: write KEY=VALUE")

@@ -11,7 +11,8 @@ import typer
 from escape_hw.cli import options
 from escape_hw.cli.command import command
 from escape_hw.cli.context import CommandContext
-from escape_hw.cli.devices.device_tools import announce_change, open_device
+from escape_hw.cli.devices.device_tools import announce_change
+from escape_hw.errors import ConfigError
 
 if TYPE_CHECKING:
     from escape_hw.api.modulator import Modulation, ModulatorStatus, TipTiltModulator
@@ -56,7 +57,7 @@ def start(
     announce_change(
         context, config, "modulator", "servos on, auto-zero where needed, centre, then the circle"
     )
-    with open_device(context, device):
+    with context.opened(device):
         achievable = device.check(requested)
         context.notify(f"requested: {_format_modulation(requested, section)}")
         context.notify(f"achievable: {_format_modulation(achievable, section)}")
@@ -80,7 +81,7 @@ def stop(context: CommandContext, selection: options.Selection) -> None:
     """Stop and park: MOVES the stage to its centre, then switches its servos off."""
     config, section, device = _device(context, selection)
     announce_change(context, config, "modulator", "centre, servos off")
-    with open_device(context, device):
+    with context.opened(device):
         device.park()
         status = device.status()
     context.show(*_format_status(status, section), "left parked")
@@ -110,7 +111,6 @@ def _device(
     """
     from escape_hw.api.modulator import TipTiltModulator
     from escape_hw.bench import build_device
-    from escape_hw.errors import ConfigError
 
     config = context.load_config(selection)
     section = config.devices.modulator

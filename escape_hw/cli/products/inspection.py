@@ -9,6 +9,7 @@ import typer
 
 from escape_hw.cli.command import command
 from escape_hw.cli.context import CommandContext
+from escape_hw.errors import CalibrationError
 
 if TYPE_CHECKING:
     from escape_hw.api.interaction_matrix import InteractionMatrix
@@ -90,7 +91,6 @@ def _optical_gains(
 ) -> dict[str, Any] | None:
     """Gains of B relative to A, by the paper's ratio of deviations and by an unbiased projection."""
     from escape_hw.calibration.optical_gain.matrix_comparison import deviation_ratio, projection
-    from escape_hw.errors import CalibrationError
 
     try:
         found = {"deviation_ratio": deviation_ratio(b, a), "projection": projection(b, a)}

@@ -10,6 +10,7 @@ import typer
 from escape_hw.cli import options
 from escape_hw.cli.command import command
 from escape_hw.cli.context import CommandContext
+from escape_hw.errors import ConfigError, IncompatibleProduct, ProductError
 
 if TYPE_CHECKING:
     from escape_hw.api.results import CalibrationResult
@@ -44,7 +45,6 @@ def export_pyrtc(
     """Write a matrix for pyRTC 2.x, with mask, references, modes and settings."""
     import numpy as np
 
-    from escape_hw.errors import ConfigError
     from escape_hw.io.fits.matrix import load_matrix
     from escape_hw.io.interchange.pyrtc.calibration import FrameSettings, export_matrix
     from escape_hw.io.interchange.pyrtc.files import read_file
@@ -166,7 +166,6 @@ def import_aot(
     """Read a matrix, and telemetry, of an AOT file as products of a system (needs aotpy)."""
     from dataclasses import replace
 
-    from escape_hw.errors import IncompatibleProduct
     from escape_hw.io.fits.telemetry import save_telemetry
     from escape_hw.io.interchange.aot import read_aot
     from escape_hw.runtime.session.record import config_provenance
@@ -227,7 +226,6 @@ def _system_config(product: MatrixProduct) -> SystemConfig:
         There is none.
     """
     from escape_hw.config.loader import load_text
-    from escape_hw.errors import IncompatibleProduct
 
     if not product.config_text.strip():
         raise IncompatibleProduct(f"{product.path}: has no configuration; calibrate again with this version")
@@ -271,7 +269,6 @@ def _save_import(
 
 
 def _publish(name: str, data: Any, version: str) -> None:
-    from escape_hw.errors import ConfigError
     from escape_hw.io.interchange.milk.stream import MilkStream
 
     try:
@@ -288,7 +285,6 @@ def _record_stream(context: CommandContext, stream: Stream, frames: int, out: Pa
 
     import numpy as np
 
-    from escape_hw.errors import ProductError
     from escape_hw.io.interchange.stream import StreamReadError
     from escape_hw.io.storage import write_atomic
 

@@ -10,6 +10,7 @@ import typer
 from escape_hw.cli import options
 from escape_hw.cli.command import command
 from escape_hw.cli.context import CommandContext
+from escape_hw.errors import ConfigError
 
 if TYPE_CHECKING:
     from escape_hw.config.system import SystemConfig
@@ -66,7 +67,6 @@ def init(
 ) -> None:
     """Write a new configuration: every key with its meaning, unit and range."""
     from escape_hw.config.templates import starter_text
-    from escape_hw.errors import ConfigError
     from escape_hw.io.storage import write_atomic
 
     text = starter_text(name, base)

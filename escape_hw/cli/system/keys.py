@@ -9,6 +9,7 @@ import typer
 from escape_hw.cli import options
 from escape_hw.cli.command import command
 from escape_hw.cli.context import CommandContext
+from escape_hw.errors import ConfigError
 
 app = typer.Typer(
     no_args_is_help=True, help="Keys for servers and clients on different computers (escape serve --bind)."
@@ -82,7 +83,6 @@ def trust(context: CommandContext, host: Name, key: Key) -> None:
 @command("keys")
 def remove(context: CommandContext, name: Name) -> None:
     """Remove an allowed client or a trusted server."""
-    from escape_hw.errors import ConfigError
     from escape_hw.remote import keys
 
     if not keys.remove(name):

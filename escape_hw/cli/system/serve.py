@@ -10,6 +10,7 @@ import typer
 from escape_hw.cli import options
 from escape_hw.cli.command import command
 from escape_hw.cli.context import CommandContext
+from escape_hw.errors import ConfigError
 
 if TYPE_CHECKING:
     from escape_hw.config.system import SystemConfig
@@ -38,7 +39,6 @@ def serve(
     ] = None,
 ) -> None:
     """Open the devices of a system, and serve windows, scripts and notebooks until stopped."""
-    from escape_hw.errors import ConfigError
     from escape_hw.io.run_folder import default_runs_folder
     from escape_hw.server.frontend.server import Server
 
@@ -46,12 +46,11 @@ def serve(
         raise ConfigError(f"--bind {bind} needs --port; without it the server has local sockets only")
     config = context.load_config(selection)
     runs = default_runs_folder() if out is None else out.expanduser().absolute()
-    with Server(config, bind, port) as server:
+    with context.interrupts.protect_closing(Server(config, bind, port)) as server:
         _print_listing(context, config, server.listing)
         with context.interrupts.procedure() as stop:
             context.devices_opened = True
             server.run(stop, runs, tuple(read or ()))
-        context.interrupts.begin_closing()
     context.notify("serve: stopped, mirror flat")
 
 

@@ -57,8 +57,22 @@ class Parameter:
         ``run`` (folder of an earlier run).
     default
         Value if absent. ``None``: the value of ``config_key`` or, without a key, no value.
-    required
-        Whether the parameter has no default.
+    help, label
+        One sentence for every interface, and words for the window's form (the name by default).
+    unit, low, high
+        Unit, smallest and largest value of a number.
+    choices
+        The possible values of a text.
+    config_key
+        Key of the system's configuration whose value is the default, such as ``"loop.gain"``.
+    sets_config
+        A given value replaces the value of ``config_key`` in the configuration of the run.
+    on_server
+        Whether a server offers the parameter.
+    last
+        List the parameter after those of derived classes.
+    deprecated, deprecated_inverse
+        Names of earlier versions; the latter belong to booleans of the opposite meaning.
     """
 
     name: str
@@ -134,57 +148,13 @@ class Parameter:
         return int(value) if self.kind == "int" else float(value)
 
 
-def parameter(
-    *,
-    default: Any = dataclasses.MISSING,
-    help: str = "",
-    label: str = "",
-    unit: str = "",
-    low: float | None = None,
-    high: float | None = None,
-    choices: tuple[str, ...] = (),
-    kind: str = "",
-    config_key: str = "",
-    sets_config: bool = False,
-    on_server: bool = True,
-    last: bool = False,
-    deprecated: tuple[str, ...] = (),
-    deprecated_inverse: tuple[str, ...] = (),
-) -> Any:
-    """Declare a parameter in the body of a :class:`ProcedureSpec`.
+def parameter(*, default: Any = dataclasses.MISSING, kind: str = "", **attributes: Any) -> Any:
+    """Declare a parameter in the body of a :class:`ProcedureSpec`; without a default it is required.
 
-    Parameters
-    ----------
-    default
-        Value if absent; a parameter without default is required.
-    help
-        One sentence for every interface.
-    label
-        Words for the window's form; the name by default.
-    unit
-        Unit of a number.
-    low, high
-        Smallest and largest value.
-    choices
-        The possible values of a text.
-    kind
-        Kind of the parameter if the annotation does not give it, see :class:`Parameter`.
-    config_key
-        Key of the system's configuration whose value is the default, such as ``"loop.gain"``.
-    sets_config
-        A given value replaces the value of ``config_key`` in the configuration of the run.
-    on_server
-        Whether a server offers the parameter.
-    last
-        List the parameter after those of derived classes.
-    deprecated, deprecated_inverse
-        Names of earlier versions; the latter belong to booleans of the opposite meaning.
+    The attributes are those of :class:`Parameter`. ``kind`` is needed if the annotation does not give it.
     """
-    declared = Parameter(
-        "", kind, None if default is dataclasses.MISSING else default, default is dataclasses.MISSING,
-        help, label, unit, low, high, choices, config_key, sets_config, on_server, last,
-        deprecated, deprecated_inverse,
-    )  # fmt: skip
+    required = default is dataclasses.MISSING
+    declared = Parameter("", kind, None if required else default, required, **attributes)
     return field(default=default, metadata={"parameter": declared})
 
 

@@ -64,4 +64,4 @@ class ModelPsfProcedure(ProcedureSpec[ModelPsf]):
         image = result.model_psf
         values = {"peak": float(image.max()), "total": float(image.sum(dtype=float))}
         title = f"Model PSF of {record.system}"
-        return save_values(folder, record, self.name, title, wall_seconds, **values)
+        return save_values(folder, record, self.name, title, values, wall_seconds)

@@ -60,11 +60,16 @@ def save_run(
 
 
 def save_values(
-    folder: RunFolder, record: BenchRecord, command: str, title: str, wall_seconds: float, **values: Any
+    folder: RunFolder,
+    record: BenchRecord,
+    name: str,
+    title: str,
+    values: Mapping[str, Any],
+    wall_seconds: float,
 ) -> SavedRun:
-    """Save a result that consists of a few numbers, without products and report."""
+    """Save a result that consists of a few numbers, by their names, without products and report."""
     content = {**values, "partial": False, "products": {}}
-    document = _document(record, command, title, wall_seconds, content)
+    document = _document(record, name, title, wall_seconds, content)
     folder.write_result(document)
     return SavedRun({**document, **folder.location_fields()})
 

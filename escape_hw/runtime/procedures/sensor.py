@@ -40,9 +40,5 @@ class SensorProcedure(ProcedureSpec["SensorSetup"]):
 
         grid = result.grid
         title = f"Sensor of {record.system}"
-        return save_values(
-            folder, record, self.name, title, wall_seconds,
-            n_sub_apertures=grid.n_valid,
-            counts=grid.counts,
-            background=grid.background,
-        )  # fmt: skip
+        values = {"n_sub_apertures": grid.n_valid, "counts": grid.counts, "background": grid.background}
+        return save_values(folder, record, self.name, title, values, wall_seconds)
