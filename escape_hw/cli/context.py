@@ -172,13 +172,7 @@ class CommandContext:
         self.result({**header_fields(self.command, **self._subject), **content}, met)
 
     def load_config(self, selection: SystemSelection) -> SystemConfig:
-        """The configuration of the selected system; its name, mode and seed then appear in error documents.
-
-        Raises
-        ------
-        ConfigError
-            The configuration is wrong.
-        """
+        """The configuration of the selected system; error documents then have its name, mode and seed."""
         from escape_hw.config.bundled import bundled_systems
         from escape_hw.config.loader import load_system
 
@@ -304,13 +298,7 @@ class CommandContext:
         return self.interrupts.protect_closing(device)
 
     def _require_not_served(self, selection: SystemSelection) -> None:
-        """Refuse to open hardware that a server has opened.
-
-        Raises
-        ------
-        ConfigError
-            A server has opened the system; the message names its process and the alternatives.
-        """
+        """Refuse to open hardware that a server has opened."""
         from escape_hw.remote.address import find_server
 
         config = self.load_config(selection)

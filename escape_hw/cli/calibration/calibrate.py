@@ -65,13 +65,7 @@ def _calibrate(
 
 
 def _request(method: str | None, arguments: dict[str, Any]) -> CalibrationProcedure:
-    """The request of the method that is given, or of the run to resume.
-
-    Raises
-    ------
-    ConfigError
-        The method is unknown or does not have one of the given options.
-    """
+    """The request of the method that is given, or of the run to resume."""
     if method is None:
         resume = arguments["resume"]
         method = "escape" if resume is None else str(saved_request(resume)["method"])

@@ -13,7 +13,7 @@ import typer
 from escape_hw.cli import options
 from escape_hw.cli.command import command
 from escape_hw.cli.context import CommandContext
-from escape_hw.errors import Aborted, ConfigError
+from escape_hw.errors import ConfigError
 
 if TYPE_CHECKING:
     from escape_hw.bench import Bench
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from escape_hw.runtime.sweep.description import SweepDescription
     from escape_hw.runtime.sweep.design import MatrixVariant
     from escape_hw.runtime.sweep.result import SweepResult
-    from escape_hw.runtime.sweep.workers import Workers
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,17 +140,18 @@ def sweep(
         if _show_finished(context, resume, resumed):
             return
     with context.run_folder(config, "sweep", out) as folder:
-        with context.bench(selection) as bench:
-            from escape_hw.runtime.session.record import BenchRecord
+        from escape_hw.runtime.session.record import BenchRecord
+        from escape_hw.runtime.sweep.result import sweep_and_analyse
+        from escape_hw.runtime.sweep.workers import open_workers
 
+        with context.bench(selection) as bench:
             record = BenchRecord.from_bench(bench)
             description = resumed or _describe(context, request, bench, folder, record)
             if not bench.simulated:
-                result, stop = _run(context, description, bench)
+                result, stop = context.run_keeping_partial(sweep_and_analyse(description, bench))
         if description.sweep.simulated:
-            from escape_hw.runtime.sweep.workers import open_workers
-
-            result, stop = _run(context, description, open_workers(workers, scheduler))
+            pool = open_workers(workers, scheduler)
+            result, stop = context.run_keeping_partial(sweep_and_analyse(description, pool))
         with context.protect_saving(stop):
             _save(context, folder, record, description, result)
         if stop is not None:
@@ -210,22 +210,6 @@ def _prepare_variants(
     pyramid = config.sensor.kind == "pyramid"
     measured = context.run(measure_variants(bench, frames=frames, gain_frames=frames if pyramid else 0))
     return save_variants(folder, record, measured)
-
-
-def _run(
-    context: CommandContext, description: SweepDescription, runner: Workers | Bench
-) -> tuple[SweepResult, Aborted | None]:
-    from escape_hw.bench import Bench
-    from escape_hw.runtime.sweep.result import analyse_sweep
-    from escape_hw.runtime.sweep.run import run_sweep
-
-    try:
-        procedure = run_sweep(description.open_study(), runner)
-        found, stop = context.run_keeping_partial(procedure)
-    finally:
-        if not isinstance(runner, Bench):
-            runner.close()
-    return analyse_sweep(description.sweep, found, description.margin), stop
 
 
 def _save(

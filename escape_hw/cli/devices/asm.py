@@ -73,24 +73,15 @@ def clear(
             after = mirror.health
     context.show(f"fault: {previous.fault or 'none'}; now {after.state}")
     context.report(
-        simulated=mirror.info.simulated,
-        changed=after is not previous,
-        before=previous.state,
-        fault=previous.fault,
-        after=after.state,
-    )
+        simulated=mirror.info.simulated, changed=after is not previous, before=previous.state,
+        fault=previous.fault, after=after.state,
+    )  # fmt: skip
 
 
 def _secondary(
     context: CommandContext, selection: options.SystemSelection
 ) -> tuple[SystemConfig, AdaptiveSecondary]:
-    """The system's adaptive secondary, not open.
-
-    Raises
-    ------
-    ConfigError
-        The mirror is no adaptive secondary.
-    """
+    """The system's adaptive secondary, not open."""
     from escape_hw.api.adaptive_secondary import AdaptiveSecondary
 
     config, mirror = build_single_device(context, selection, "dm", AdaptiveSecondary)  # type: ignore[type-abstract]
@@ -114,12 +105,9 @@ def _go_to_state(context: CommandContext, selection: options.SystemSelection, *,
         health = mirror.health
     context.show(f"{previous} → {health.state}", *_format_health(health))
     context.report(
-        simulated=mirror.info.simulated,
-        changed=previous is not health.state,
-        before=previous,
-        after=health.state,
-        health=asdict(health),
-    )
+        simulated=mirror.info.simulated, changed=previous is not health.state, before=previous,
+        after=health.state, health=asdict(health),
+    )  # fmt: skip
 
 
 def _format_health(health: ShellHealth) -> list[str]:

@@ -62,18 +62,10 @@ def snap(
         *([f"written: {out}"] if out is not None else []),
     )
     context.report(
-        simulated=info.simulated,
-        changed=changed,
-        camera=camera,
-        frames=len(frame_list),
-        shape=cube.shape[1:],
-        counts=counts,
-        saturated=saturated,
-        lost=status.lost,
-        first_index=frame_list[0].index,
-        settings=asdict(settings),
-        file=out,
-    )
+        simulated=info.simulated, changed=changed, camera=camera, frames=len(frame_list),
+        shape=cube.shape[1:], counts=counts, saturated=saturated, lost=status.lost,
+        first_index=frame_list[0].index, settings=asdict(settings), file=out,
+    )  # fmt: skip
 
 
 @app.command("stream")
@@ -100,12 +92,9 @@ def stream(
         f"{statistics.saturated} saturated",
     )
     context.report(
-        simulated=info.simulated,
-        changed=changed,
-        camera=camera,
-        settings=asdict(settings),
+        simulated=info.simulated, changed=changed, camera=camera, settings=asdict(settings),
         **asdict(statistics),
-    )
+    )  # fmt: skip
     context.code = context.code or int(statistics.status.lost > 0)
 
 
@@ -138,13 +127,9 @@ def settings(
     if now != requested:
         context.notify(f"requested: {requested}")
     context.report(
-        simulated=info.simulated,
-        changed=not check,
-        camera=camera,
-        asked=asdict(requested),
-        settings=asdict(now),
-        as_asked=now == requested,
-    )
+        simulated=info.simulated, changed=not check, camera=camera, asked=asdict(requested),
+        settings=asdict(now), as_asked=now == requested,
+    )  # fmt: skip
 
 
 def _camera(
@@ -171,13 +156,7 @@ def _apply_configuration(
 def _requested_settings(
     base: CameraSettings, exposure: float | None, rate: float | None, gain: float | None, region: str | None
 ) -> CameraSettings:
-    """The configured settings with the options applied.
-
-    Raises
-    ------
-    ConfigError
-        The region is not four integers.
-    """
+    """The configured settings with the options applied."""
     from escape_hw.api.camera import Region
 
     if region is not None:

@@ -26,13 +26,7 @@ def announce_change(context: CommandContext, config: SystemConfig, key: str, wha
 def build_single_device(
     context: CommandContext, selection: SystemSelection, key: str, kind: type[D]
 ) -> tuple[SystemConfig, D]:
-    """Configuration and one device of a system, not open.
-
-    Raises
-    ------
-    ConfigError
-        Wrong configuration, or no such device.
-    """
+    """Configuration and one device of a system, not open."""
     from escape_hw.bench import build_device
 
     config = context.load_config(selection)

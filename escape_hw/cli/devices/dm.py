@@ -118,15 +118,9 @@ def status(context: CommandContext, selection: options.Selection) -> None:
     )
     context.show(f"limits: {', '.join(f'{key} {value}' for key, value in asdict(limits).items())}")
     context.report(
-        simulated=info.simulated,
-        changed=changed,
-        model=info.model,
-        serial=info.serial,
-        n_act=info.n_act,
-        stroke_m=info.stroke_m,
-        limits=asdict(limits),
-        **rest,
-    )
+        simulated=info.simulated, changed=changed, model=info.model, serial=info.serial, n_act=info.n_act,
+        stroke_m=info.stroke_m, limits=asdict(limits), **rest,
+    )  # fmt: skip
 
 
 def _mirror(
@@ -146,13 +140,7 @@ def _preserve_floating(dm: DeformableMirror) -> None:
 
 
 def _require_actuator(config: SystemConfig, actuator: int, amplitude: float) -> None:
-    """Check the poke before anything is opened.
-
-    Raises
-    ------
-    ConfigError
-        The actuator does not exist or is disabled, or the poke exceeds the stroke.
-    """
+    """Refuse a poke of a missing or disabled actuator, or beyond the stroke, before anything is opened."""
     section = config.devices.dm
     if actuator >= section.n_act:
         raise ConfigError(f"actuator {actuator}: does not exist; the mirror has 0 to {section.n_act - 1}")

@@ -102,13 +102,7 @@ def status(context: CommandContext, selection: options.Selection) -> None:
 def _device(
     context: CommandContext, selection: options.SystemSelection
 ) -> tuple[SystemConfig, ModulatorConfig, TipTiltModulator]:
-    """The system's modulator, not open.
-
-    Raises
-    ------
-    ConfigError
-        The system has none, or its driver is not installed.
-    """
+    """The system's modulator, not open."""
     from escape_hw.api.modulator import TipTiltModulator
     from escape_hw.bench import build_device
 

@@ -218,13 +218,7 @@ def import_pyrtc_stream(
 
 
 def _system_config(product: MatrixProduct) -> SystemConfig:
-    """The configuration stored in a product.
-
-    Raises
-    ------
-    IncompatibleProduct
-        There is none.
-    """
+    """The configuration stored in a product."""
     from escape_hw.config.loader import load_text
 
     if not product.config_text.strip():

@@ -60,13 +60,7 @@ def _processor() -> str:
 
 
 def require_page(page: Path) -> None:
-    """Check that the table can be written into a page.
-
-    Raises
-    ------
-    ConfigError
-        The page exists without the two marks, or its folder does not exist.
-    """
+    """Check that the table can be written into a page."""
     if page.exists():
         text = page.read_text(encoding="utf-8")
         if text.count(BEGIN) != 1 or text.count(END) != 1 or text.index(BEGIN) > text.index(END):
@@ -122,13 +116,7 @@ def find_benchmarks() -> dict[str, EntryPoint]:
 
 
 def run_benchmarks(stages: Sequence[str] = ()) -> list[BenchmarkRow]:
-    """Run the named benchmark stages, all of them by default.
-
-    Raises
-    ------
-    ConfigError
-        A stage does not exist.
-    """
+    """Run the named benchmark stages, all of them by default."""
     from escape_hw.api.concurrency import limit_to_one_thread
 
     known = find_benchmarks()

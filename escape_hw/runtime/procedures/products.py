@@ -45,11 +45,12 @@ def add_result(
         The file cannot be written.
     """
     path, origin = folder.file(f"{name}.fits"), record.origin({one.name: file_sha256(one) for one in parents})
+    # A partial result is saved under a name that says so.
     if isinstance(result, CalibrationResult):
-        save_matrix(path, result, origin)
+        saved = save_matrix(path, result, origin)
     else:
-        _SAVE[type(result)](path, result, record.system, record.simulated, origin)
-    return folder.add_product(name, path)
+        saved = _SAVE[type(result)](path, result, record.system, record.simulated, origin)
+    return folder.add_product(name, saved)
 
 
 def save_run(

@@ -13,11 +13,15 @@ from optuna.distributions import CategoricalDistribution, FloatDistribution
 from optuna.importance import FanovaImportanceEvaluator, get_param_importances
 from optuna.trial import create_trial
 
+from escape_hw.api.procedure import Procedure
 from escape_hw.api.results import Estimate, StrehlEstimate
+from escape_hw.bench import Bench
 from escape_hw.pipeline.statistics import MIN_PAIRS, PairedComparison, compare_pairs, describe_comparison
+from escape_hw.runtime.sweep.description import SweepDescription
 from escape_hw.runtime.sweep.design import EXPLORE, FINAL, METRICS, MatrixVariant, Sweep
-from escape_hw.runtime.sweep.run import SweepRun
+from escape_hw.runtime.sweep.run import SweepRun, run_sweep
 from escape_hw.runtime.sweep.study import TrialRecord
+from escape_hw.runtime.sweep.workers import Workers
 
 #: Importance of a dummy parameter without effect: the share that noise gives to any parameter.
 CHANCE = "chance"
@@ -114,6 +118,16 @@ def analyse_sweep(sweep: Sweep, run: SweepRun, margin: float = DEFAULT_MARGIN) -
         tuple(_comparisons(sweep, at_random, margin)),
         importances(sweep, run.records), importances(sweep, run.records, closed_only=True),
     )  # fmt: skip
+
+
+def sweep_and_analyse(description: SweepDescription, runner: Workers | Bench) -> Procedure[SweepResult]:
+    """Run a sweep, see :func:`~escape_hw.runtime.sweep.run.run_sweep`, close its workers, and analyse it."""
+    try:
+        run = yield from run_sweep(description.open_study(), runner)
+    finally:
+        if isinstance(runner, Workers):
+            runner.close()
+    return analyse_sweep(description.sweep, run, description.margin)
 
 
 def _summarise_final(final: Sequence[TrialRecord]) -> BestLoops:
