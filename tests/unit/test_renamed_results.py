@@ -5,6 +5,8 @@ from __future__ import annotations
 import fake_results as fake
 import pytest
 
+from escape_hw.api.procedure import Reporter
+
 
 def test_a_registration():
     estimate = fake.registration()
@@ -18,3 +20,9 @@ def test_optical_gains():
     result = fake.gains_result()
     with pytest.warns(DeprecationWarning, match=r"GainsResult.beside is called"):
         assert result.beside is result.comparisons
+
+
+def test_a_reporter():
+    report = Reporter("stage", 3)
+    with pytest.warns(DeprecationWarning, match=r"Reporter.due is called Reporter.is_due"):
+        assert report.due()

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated
 
 import typer
 
 from escape_hw.cli.command import command
 from escape_hw.cli.context import CommandContext
 from escape_hw.cli.options import NO_SYSTEM, SystemSelection
-
-if TYPE_CHECKING:
-    from escape_hw.runtime.host.doctor import Finding
 
 _SYMBOLS = {"ok": "✓", "info": "·", "warning": "!", "error": "✗"}
 
@@ -38,10 +35,6 @@ def doctor(
             context.show(f"    → {finding.remedy}")
     code = exit_code(findings)
     context.set_subject(selection.system or None, None if config is None else config.simulated, None)
-    context.report(verdict=code, findings=[_to_dict(one) for one in findings])
+    # "way_out" is the name of version 0.1.0.
+    context.report(verdict=code, findings=[{**asdict(one), "way_out": one.remedy} for one in findings])
     context.code = code
-
-
-def _to_dict(finding: Finding) -> dict[str, Any]:
-    """A finding for ``--json``; version 0.1.0 called the remedy ``way_out``."""
-    return {**asdict(finding), "way_out": finding.remedy}

@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Iterable
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -44,7 +44,11 @@ def streams(
     if remove_orphaned and not removed:
         context.notify("nothing to remove: the process of every stream is alive")
     rows = () if remove_orphaned else _watch_streams(context, seconds)
-    context.report(streams=[_to_document(row) for row in rows], removed=[s.name for s in removed])
+    documents = [
+        {**asdict(row), "interval_us": dict(zip(("p50", "p99", "max"), row.interval_us, strict=True))}
+        for row in rows
+    ]
+    context.report(streams=documents, removed=[segment.name for segment in removed])
 
 
 def _watch_streams(context: CommandContext, seconds: float | None) -> tuple[StreamStatus, ...]:
@@ -96,8 +100,3 @@ def _cells(row: StreamStatus) -> tuple[str, ...]:
 
 def _number(value: float, form: str) -> str:
     return format(value, form) if math.isfinite(value) else "–"
-
-
-def _to_document(row: StreamStatus) -> dict[str, Any]:
-    p50, p99, largest = row.interval_us
-    return {**asdict(row), "interval_us": {"p50": p50, "p99": p99, "max": largest}}

@@ -9,7 +9,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from escape_hw.api.procedure import Procedure, Reporter
 from escape_hw.api.representation import short_repr
@@ -191,7 +190,7 @@ def shortlist(
     closed = [number for number, record in enumerate(own) if record.merit > 0]
     if not closed:
         return []
-    points = np.stack([_unit_point(record.values, space) for record in own])
+    points = np.array([[unit_coordinate(one, record.values[one.key]) for one in space] for record in own])
     merits = np.array([record.merit for record in own])
     n_neighbours = max(1, min(_MAX_NEIGHBOURS, round(_MAX_NEIGHBOUR_FRACTION * len(own))))
 
@@ -200,10 +199,6 @@ def shortlist(
         return float(merits[np.argsort(distance, kind="stable")[:n_neighbours]].mean())
 
     return [own[n].values for n in sorted(closed, key=neighbour_mean, reverse=True)[:count]]
-
-
-def _unit_point(values: dict[str, Any], space: Sequence[Parameter]) -> NDArray[np.float64]:
-    return np.array([unit_coordinate(one, values[one.key]) for one in space])
 
 
 def unit_coordinate(one: Parameter, value: Any) -> float:
