@@ -47,19 +47,18 @@ def build_command(
     without: tuple[str, ...] = (),
 ) -> Command:
     """The command of a function with these parameters beside ``context``; see :func:`command`."""
-    own = {one.name: one for one in parameters}
-    selection = own.get("selection")
-    shared = (
-        {} if selection is None else {key: kind for key, kind in _SELECTION.items() if key not in without}
-    )
-    shared |= {"json": options.Json, **({"quiet": options.Quiet} if quiet else {})}
-    signature = inspect.Signature(
-        [
-            *(_system(one) if one is selection else keyword(key, one.annotation, one.default)
-              for key, one in own.items()),
-            *(keyword(key, kind, None if key in _SELECTION else False) for key, kind in shared.items()),
-        ]
-    )  # fmt: skip
+    declared, selection = [], None
+    for one in parameters:
+        if one.name == "selection":
+            selection = one
+            declared.append(_system(one))
+        else:
+            declared.append(keyword(one.name, one.annotation, one.default))
+    if selection is not None:
+        declared += [keyword(key, kind, None) for key, kind in _SELECTION.items() if key not in without]
+    declared.append(keyword("json", options.Json, False))
+    if quiet:
+        declared.append(keyword("quiet", options.Quiet, False))
 
     def wrapper(**values: Any) -> None:
         given = {key: values.pop(key, None) for key in ("json", "quiet")}
@@ -71,8 +70,8 @@ def build_command(
             function(context, **values)
 
     wrapper.__name__, wrapper.__doc__ = name.replace("-", "_"), help or function.__doc__
-    wrapper.__signature__ = signature  # type: ignore[attr-defined]
-    wrapper.__annotations__ = {key: one.annotation for key, one in signature.parameters.items()}
+    wrapper.__signature__ = inspect.Signature(declared)  # type: ignore[attr-defined]
+    wrapper.__annotations__ = {one.name: one.annotation for one in declared}
     return wrapper
 
 
