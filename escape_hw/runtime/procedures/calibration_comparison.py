@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from escape_hw.api.optical_gains import GainsResult
+from escape_hw.api.optical_gains import GainsResult, OpticalGains
 from escape_hw.api.procedure import Procedure
 from escape_hw.api.representation import short_repr
 from escape_hw.api.results import CalibrationResult, LoopResult
@@ -108,9 +108,6 @@ def with_and_without_optical_gains(
     known: Mapping[str, CalibrationResult], result: CalibrationComparison
 ) -> Iterator[tuple[str, CalibrationResult]]:
     """Each matrix unscaled and scaled by its optical gains, with its label."""
-    from escape_hw.calibration.optical_gain.matrix_comparison import scale_matrix
-    from escape_hw.calibration.optical_gain.smoothing import clip_gains
-
     if result.gains is None or result.gains.gains is None:
         return
     gains_of = {"ESCAPE": result.gains.gains, **result.gains.comparisons}
@@ -118,9 +115,17 @@ def with_and_without_optical_gains(
         yield label, one
         if label == "ESCAPE" and result.rescaled_calibration is not None:
             yield label + WITH_GAINS, result.rescaled_calibration
-            continue
-        scaled = scale_matrix(one.matrix, clip_gains(gains_of[label]), gains_of[label].best_sigma)
-        yield label + WITH_GAINS, replace(one, matrix=scaled, measured=None)
+        else:
+            yield label + WITH_GAINS, scale_by_gains(one, gains_of[label])
+
+
+def scale_by_gains(calibration: CalibrationResult, gains: OpticalGains) -> CalibrationResult:
+    """A calibration with its matrix scaled by its optical gains."""
+    from escape_hw.calibration.optical_gain.matrix_comparison import scale_matrix
+    from escape_hw.calibration.optical_gain.smoothing import clip_gains
+
+    scaled = scale_matrix(calibration.matrix, clip_gains(gains), gains.best_sigma)
+    return replace(calibration, matrix=scaled, measured=None)
 
 
 def close_loop_at_best_gain(
