@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from escape_hw.api.concurrency import SignalSafeFlag
 from escape_hw.api.representation import short_repr
+from escape_hw.deprecation import renamed_members
 from escape_hw.errors import Aborted
 
 log = logging.getLogger(__name__)
@@ -80,10 +81,11 @@ Procedure = Generator[Progress, None, T]
 Observer = Callable[[Progress], None]
 
 
+@renamed_members(due="is_due")
 class Reporter:
     """Creates the :class:`Progress` of a stage, at most 20 times a second.
 
-    ``step`` and ``due`` are fast enough to be called for every frame.
+    ``step`` and ``is_due`` are fast enough to be called for every frame.
     """
 
     PERIOD_S = 0.05
@@ -97,9 +99,9 @@ class Reporter:
     def step(self, **metrics: float) -> Progress | None:
         """Count one step; returns a progress to yield if one is due, else ``None``."""
         self._done += 1
-        return self(self._done, **metrics) if self.due() else None
+        return self(self._done, **metrics) if self.is_due() else None
 
-    def due(self) -> bool:
+    def is_due(self) -> bool:
         """Whether the next progress is due."""
         return time.monotonic() >= self._next
 

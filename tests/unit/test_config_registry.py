@@ -184,7 +184,7 @@ def test_a_script_may_register_a_driver_of_its_own(monkeypatch: pytest.MonkeyPat
 def test_a_twin_is_never_offered_instead_of_a_driver() -> None:
     with pytest.raises(ConfigError) as refused:
         registry.device_factory("alpaka", hardware=True)
-    assert "no driver 'alpaka' for real hardware is installed" in str(refused.value)
+    assert "no driver for real hardware 'alpaka' is installed" in str(refused.value)
     assert "sim-" not in str(refused.value)
     assert "--mode sim" in str(refused.value)
 

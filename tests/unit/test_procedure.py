@@ -336,7 +336,7 @@ def test_reporter_is_due_at_once_and_then_at_most_twenty_times_a_second(
     report = Reporter("frames", 1000)
     yielded = []
     for frame in range(1000):
-        if report.due():
+        if report.is_due():
             yielded.append(report(frame, flux=2.0))
         now += 0.002
     assert len(yielded) == pytest.approx(2.0 / Reporter.PERIOD_S, abs=1)

@@ -198,7 +198,7 @@ def _old_files(folder: Path, result: CalibrationResult) -> PyrtcConfig:
 def test_files_of_1x_are_read_when_somebody_says_how_they_were_made(tmp_path: Path) -> None:
     result = lenslets()
     config = _old_files(tmp_path, result)
-    with pytest.raises(IncompatibleProduct, match="--legacy yx"):
+    with pytest.raises(IncompatibleProduct, match="--frame-order yx"):
         import_matrix(config, target(result))
     with pytest.raises(ConfigError, match="it is one of yx, xy, as_is"):
         import_matrix(config, target(result), frame_order="zz")

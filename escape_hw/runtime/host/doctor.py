@@ -40,18 +40,10 @@ MIN_PRIORITY = 90
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """Result of one check.
+    """Result of one check: what was checked, what was found, and what to do about it (may be empty).
 
-    Parameters
-    ----------
-    item
-        What was checked.
-    level
-        ``ok``, ``info`` (reported only), ``warning`` (works, but not well) or ``error`` (will not work).
-    text
-        What was found.
-    remedy
-        What to do about it; empty for nothing.
+    ``level`` is ``ok``, ``info`` (reported only), ``warning`` (works, but not well) or ``error`` (will not
+    work).
     """
 
     item: str
@@ -65,15 +57,9 @@ def check_computer(
 ) -> list[Finding]:
     """Check packages, vendor libraries, permissions, USB, serial lines, processor, network and disk.
 
-    Parameters
-    ----------
-    config
-        A system: missing needs of its real devices are errors. Without one every driver is checked, and
-        missing libraries are only reported.
-    host
-        The computer; this one by default.
-    data
-        Folder for products; the user's data folder by default.
+    With a configuration, missing needs of the system's real devices are errors. Without one, every driver is
+    checked, and missing libraries are only reported. ``data`` is the folder for products, by default the
+    user's.
     """
     host = host or Host()
     hardware = _hardware_sections(config)
