@@ -234,10 +234,10 @@ def test_new_contamination_is_reported_with_the_line_to_configure() -> None:
     ("word", "message"),
     [
         ("hots=x", "did you mean 'host'"),
-        ("port=0", "allowed range 1 to 65535"),
-        ("reply_s=-1.0", "reply_s: -1  is out of range"),
+        ("port=0", "allowed range 1 <= x <= 65535"),
+        ("reply_s=-1.0", "reply_s: -1.0  is out of range"),
         ("max_skips=0", "max_skips: 0  is out of range"),
-        ("lift=1", "type bool"),
+        ("lift=1", "must be a valid boolean"),
     ],
 )
 def test_wrong_options_are_refused(word: str, message: str) -> None:

@@ -6,16 +6,17 @@ import logging
 import os
 from collections.abc import Callable
 from ctypes import c_void_p
-from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from pydantic import Field
 
 from escape_drivers.alpao.library import AlpaoLibrary, format_version
-from escape_drivers.common.options import parse_options, require_in_range, require_serial
+from escape_drivers.common.options import parse_options, require_serial
 from escape_hw.api.mirror import DeformableMirror, DMInfo
+from escape_hw.config.section import Section
 from escape_hw.errors import CommandRejected, DeviceError
 
 if TYPE_CHECKING:
@@ -31,8 +32,7 @@ _TRIGGER_OUT = {"long": 0.0, "short": 1.0}
 _CONFIG_VARIABLE = "ACECFG"
 
 
-@dataclass(frozen=True, slots=True)
-class AlpaoOptions:
+class AlpaoOptions(Section):
     """The ``[devices.dm.options]`` of this driver; what is left at its default is not sent.
 
     Parameters
@@ -54,7 +54,7 @@ class AlpaoOptions:
     library: str = ""
     config_folder: str = ""
     sync: Literal["", "wait", "return"] = ""
-    ack_timeout_ms: int = 0
+    ack_timeout_ms: int = Field(0, ge=0, le=60_000)
     trigger_in: Literal["", "off", "rising", "falling"] = ""
     trigger_out: Literal["", "long", "short"] = ""
 
@@ -83,22 +83,11 @@ def make_mirror(name: str, config: SystemConfig, shared: dict[str, object]) -> A
     section = config.devices.dm
     require_serial(name, section)
     options = parse_options(AlpaoOptions, name, section)
-    require_in_range(name, options, {"ack_timeout_ms": (0, 60_000)})
     return AlpaoMirror(name, section, options)
 
 
 class AlpaoMirror(DeformableMirror):
-    """An ALPAO mirror. Closing ramps to flat, stops, resets and releases it, in this order.
-
-    Parameters
-    ----------
-    name
-        Key in ``[devices]``.
-    section
-        Geometry, serial number and limits.
-    options
-        Of this driver.
-    """
+    """An ALPAO mirror. Closing ramps to flat, stops, resets and releases it, in this order."""
 
     def __init__(self, name: str, section: MirrorConfig, options: AlpaoOptions) -> None:
         super().__init__(name, section.limits.to_limits())
@@ -124,13 +113,7 @@ class AlpaoMirror(DeformableMirror):
 
     @property
     def handle(self) -> c_void_p:
-        """The SDK's handle, for calls that this driver does not make.
-
-        Raises
-        ------
-        NotOpen
-            The mirror is not connected.
-        """
+        """The SDK's handle, for calls that this driver does not make; raises ``NotOpen`` when closed."""
         self.require_open()
         return self._require_connected()[1]
 

@@ -15,8 +15,8 @@ from escape_drivers.asm import messages as m
 from escape_drivers.asm.codec import AsmCodec
 from escape_drivers.asm.link import AsmLink, MirrorRefusal
 from escape_drivers.asm.messages import Welcome
-from escape_drivers.asm.options import EMULATOR, OPTION_RANGES, AsmOptions
-from escape_drivers.common.options import parse_options, require_in_range, require_serial
+from escape_drivers.asm.options import EMULATOR, AsmOptions
+from escape_drivers.common.options import parse_options, require_serial
 from escape_hw.api.adaptive_secondary import AdaptiveSecondary, ShellHealth, ShellState
 from escape_hw.api.emulator import Emulator, EmulatorRequest
 from escape_hw.api.mirror import DMInfo
@@ -119,7 +119,6 @@ def make_asm(name: str, config: SystemConfig, shared: dict[str, object]) -> AsmM
     section = config.devices.dm
     require_serial(name, section)
     options = parse_options(AsmOptions, name, section)
-    require_in_range(name, options, OPTION_RANGES)
     emulator = None
     if options.host == EMULATOR:
         emulator = emulator_factory("asm")(EmulatorRequest(port=0, shared=shared, config=config))
