@@ -59,13 +59,7 @@ class AsmCodec:
 
     # ------------------------------------------------------------------ out
     def request(self, sequence: int, time_ns: int, message: m.Request) -> bytes:
-        """The bytes of a request.
-
-        Raises
-        ------
-        ValueError
-            A text or a list is too long.
-        """
+        """The bytes of a request; raises ``ValueError`` if a text or a list is too long."""
         kind, payload = _encode_request(message)
         return encode_frame(kind, sequence, time_ns, payload)
 
@@ -115,13 +109,7 @@ class AsmCodec:
 
 
 def encode_frame(kind: int, sequence: int, time_ns: int, payload: bytes) -> bytes:
-    """A frame around a payload.
-
-    Raises
-    ------
-    ValueError
-        The payload is larger than the protocol allows.
-    """
+    """A frame around a payload; raises ``ValueError`` if it is larger than the protocol allows."""
     if len(payload) > MAX_PAYLOAD_BYTES:
         raise ValueError(f"{len(payload)} bytes are more than the {MAX_PAYLOAD_BYTES} that a frame may have")
     head = _HEADER.pack(MAGIC, VERSIONS[1], kind, 0, sequence, len(payload), time_ns)
@@ -129,13 +117,7 @@ def encode_frame(kind: int, sequence: int, time_ns: int, payload: bytes) -> byte
 
 
 def _parse_frame(buffer: bytearray) -> tuple[int, bytes, int] | None:
-    """Type, payload and size of the first frame if it is whole.
-
-    Raises
-    ------
-    ProtocolError
-        The bytes received cannot become a frame; raised at the first wrong byte.
-    """
+    """Type, payload and size of the first frame if it is whole; ``ProtocolError`` at the first wrong byte."""
     if not MAGIC.startswith(buffer[: len(MAGIC)]):
         raise m.ProtocolError(f"a frame begins with {bytes(buffer[:4])!r}, not {MAGIC!r}")
     if len(buffer) < HEADER_BYTES:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import threading
 import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING
@@ -22,6 +21,7 @@ from escape_hw.api.emulator import Emulator, EmulatorRequest
 from escape_hw.api.mirror import DMInfo
 from escape_hw.config.registry import emulator_factory
 from escape_hw.errors import DeviceError, SettingRejected
+from escape_hw.supervision import BackgroundThread
 
 if TYPE_CHECKING:
     from escape_hw.config.devices import MirrorConfig
@@ -33,13 +33,7 @@ _ROUNDING = 1e-6
 
 
 def require_identity(name: str, section: MirrorConfig, welcome: Welcome) -> None:
-    """Require the expected mirror; an observer needs no further checks.
-
-    Raises
-    ------
-    DeviceError
-        It is another mirror.
-    """
+    """Require the expected mirror; an observer needs no further checks."""
     if welcome.last_command_m.size != section.n_act:
         raise DeviceError(
             name,
@@ -56,15 +50,6 @@ def require_identity(name: str, section: MirrorConfig, welcome: Welcome) -> None
 def require_compatible(name: str, section: MirrorConfig, welcome: Welcome) -> tuple[int, ...]:
     """Require the mirror that was meant, and limits of ours that lie within its own.
 
-    Parameters
-    ----------
-    name
-        The device's.
-    section
-        Its configuration.
-    welcome
-        Welcome message of the mirror.
-
     Returns
     -------
     tuple of int
@@ -72,8 +57,6 @@ def require_compatible(name: str, section: MirrorConfig, welcome: Welcome) -> tu
 
     Raises
     ------
-    DeviceError
-        It is another mirror.
     SettingRejected
         A limit of ours exceeds the mirror's, or actuators are out of service that the configuration
         counts on.
@@ -135,12 +118,6 @@ class AsmMirror(AdaptiveSecondary):
 
     Parameters
     ----------
-    name
-        Of the device.
-    section
-        Geometry, limits and serial number.
-    options
-        Of the link.
     make_codec
         Makes the codec of a connection; the observatory's own goes here.
     emulator
@@ -162,8 +139,7 @@ class AsmMirror(AdaptiveSecondary):
         self._link = self._make_link(m.Role.CONTROL)
         self._info = section.info("adaptive secondary over TCP", simulated=False)
         self._metres = np.empty(section.n_act)
-        self._stop = threading.Event()
-        self._heartbeat_thread: threading.Thread | None = None
+        self._heartbeat: BackgroundThread | None = None
         self._ack: m.Ack | None = None
         self._last_state, self._fault_text = ShellState.OFF, ""
         self._initial_shape: NDArray[np.float64] | None = None
@@ -183,23 +159,11 @@ class AsmMirror(AdaptiveSecondary):
         return self._ack
 
     def parameter(self, key: str) -> float:
-        """One of the mirror's own parameters, such as ``telemetry_hz``.
-
-        Raises
-        ------
-        NotOpen, DeviceError
-            Not connected, or the parameter does not exist.
-        """
+        """One of the mirror's own parameters, such as ``telemetry_hz``; ``DeviceError`` if it has none."""
         return self._parameter(m.GetParam(key))
 
     def set_parameter(self, key: str, value: float) -> float:
-        """Set one of the mirror's own parameters; returns the value in force.
-
-        Raises
-        ------
-        NotOpen, DeviceError
-            Not connected, or the mirror refused the name or the value.
-        """
+        """Set one of the mirror's own parameters; returns the value in force, ``DeviceError`` if refused."""
         return self._parameter(m.SetParam(key, value))
 
     def _parameter(self, request: m.GetParam | m.SetParam) -> float:
@@ -218,11 +182,9 @@ class AsmMirror(AdaptiveSecondary):
     def _open(self) -> None:
         self._link.address = self._start_address()
         self._apply_welcome(self._link.connect())
-        self._stop.clear()
-        self._heartbeat_thread = threading.Thread(
-            target=self._run_heartbeat, name=f"{self.name} heartbeat", daemon=True
-        )
-        self._heartbeat_thread.start()
+        period_s = self._options.heartbeat_s / 4
+        self._heartbeat = BackgroundThread(f"{self.name} heartbeat", self._send_heartbeat_if_due, period_s)
+        self._heartbeat.start()
 
     def _apply_welcome(self, welcome: m.Welcome) -> None:
         """Adopt identity and state of the mirror at the beginning of a connection."""
@@ -241,10 +203,10 @@ class AsmMirror(AdaptiveSecondary):
         self._info = self._section.info(model, simulated=welcome.simulated, serial=welcome.serial)
 
     def _close(self) -> None:
-        self._stop.set()
-        if self._heartbeat_thread is not None:
-            self._heartbeat_thread.join()
-            self._heartbeat_thread = None
+        if self._heartbeat is not None:
+            # A heartbeat in progress ends with its answer or its time-out.
+            self._heartbeat.stop(self._options.connect_s + 2 * self._options.reply_s)
+            self._heartbeat = None
         self._link.disconnect("it was closed")
         if self._emulator is not None:
             self._emulator.stop()
@@ -256,24 +218,22 @@ class AsmMirror(AdaptiveSecondary):
         return self._initial_shape
 
     # ------------------------------------------------------------------ signs of life
-    def _run_heartbeat(self) -> None:
-        """Send heartbeats when nothing else was sent for a while; restore a lost link."""
-        pause = self._options.heartbeat_s
-        while not self._stop.wait(pause / 4):
-            if self._link.is_up and time.monotonic() - self._link.last_reply_s < pause:
-                continue
-            # A thread that holds the lock is exchanging messages, which also resets the watchdog.
-            if self._lock.acquire(blocking=False):
-                try:
-                    self._send_heartbeat()
-                finally:
-                    self._lock.release()
+    def _send_heartbeat_if_due(self) -> None:
+        """Send a heartbeat when nothing else was sent for a while; restore a lost link."""
+        if self._link.is_up and time.monotonic() - self._link.last_reply_s < self._options.heartbeat_s:
+            return
+        # A thread that holds the lock is exchanging messages, which also resets the watchdog.
+        if self._lock.acquire(blocking=False):
+            try:
+                self._send_heartbeat()
+            finally:
+                self._lock.release()
 
     def _send_heartbeat(self) -> None:
         before = self._last_state
         try:
             if self._link.is_up:
-                self._ask_state()
+                self._state()
             elif self.is_open and time.monotonic() > self._retry_at_s():
                 self._reconnect()
         except DeviceError as error:
@@ -286,11 +246,8 @@ class AsmMirror(AdaptiveSecondary):
             if self._last_state is not before:
                 log.warning(
                     "%s: changed from %s to %s without a command %s",
-                    self.name,
-                    before,
-                    self._last_state,
-                    self._fault_text,
-                )
+                    self.name, before, self._last_state, self._fault_text,
+                )  # fmt: skip
 
     def _retry_at_s(self) -> float:
         """When a lost connection is tried again, on this computer's monotonic clock."""
@@ -317,7 +274,7 @@ class AsmMirror(AdaptiveSecondary):
             log.error("%s: fault: %s", self.name, message.text)
 
     # ------------------------------------------------------------------ questions
-    def _ask_state(self) -> ShellState:
+    def _state(self) -> ShellState:
         with self._lock:
             return self._record_ack(self._link.request(m.Heartbeat(), m.Ack))
 
@@ -328,9 +285,6 @@ class AsmMirror(AdaptiveSecondary):
             )
         self._ack, self._last_state = ack, ack.state
         return ack.state
-
-    def _state(self) -> ShellState:
-        return self._ask_state()
 
     def _known_state(self) -> ShellState:
         return self._last_state
@@ -371,7 +325,7 @@ class AsmMirror(AdaptiveSecondary):
             self._consecutive_skips = 0
         self._link.request(m.SetState(state), m.Done)
         deadline = time.monotonic() + self._options.step_s
-        while (now := self._ask_state()) is not state and now is not ShellState.FAULT:
+        while (now := self._state()) is not state and now is not ShellState.FAULT:
             if time.monotonic() > deadline:
                 raise DeviceError(
                     self.name, f"is {now} and not {state} after {self._options.step_s:g} s; see its health"
