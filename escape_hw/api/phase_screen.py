@@ -99,10 +99,9 @@ class PhaseScreen(Device):
         )
         if isinstance(want.screen, bool) or not isinstance(want.screen, int | np.integer):
             raise SettingRejected(self.name, f"screen is {want.screen!r}; it must be a whole number")
-        if not isinstance(want.inserted, bool | np.bool_):
-            raise SettingRejected(self.name, f"inserted is {want.inserted!r}; it must be true or false")
-        if not isinstance(want.blocked, bool | np.bool_):
-            raise SettingRejected(self.name, f"blocked is {want.blocked!r}; it must be true or false")
+        for name, value in (("inserted", want.inserted), ("blocked", want.blocked)):
+            if not isinstance(value, bool | np.bool_):
+                raise SettingRejected(self.name, f"{name} is {value!r}; it must be true or false")
         if not 0 <= want.screen < self.n_screens:
             raise SettingRejected(self.name, f"screen {want.screen} is not one of 0..{self.n_screens - 1}")
         if not 0 <= want.speed_m_s < math.inf:

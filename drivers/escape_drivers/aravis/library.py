@@ -10,7 +10,8 @@ from collections.abc import Sequence
 from ctypes import POINTER, byref, c_char_p, c_double, c_int, c_size_t, c_uint, c_uint64, c_void_p
 from typing import Any, NamedTuple
 
-from escape_drivers.common.vendor_library import LoadedLibrary, Prototypes, VendorLibrary
+from escape_drivers.common.vendor_library import LoadedLibrary, Prototypes
+from escape_hw.api.discovery import VendorLibrary
 from escape_hw.errors import DeviceError
 
 ARAVIS = VendorLibrary(

@@ -1,56 +1,17 @@
-"""Finds and loads a vendor's shared library, when a device is opened and not before."""
+"""A vendor's shared library, loaded when a device is opened and not before."""
 
 from __future__ import annotations
 
-import ctypes
-import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, ClassVar
 
+from escape_hw.api.discovery import VendorLibrary
 from escape_hw.errors import DeviceError, DeviceLost
 
 #: Symbol that only the stand-ins of this project export; they drive no hardware.
 _STAND_IN = "escape_stand_in"
 #: Type of the result and types of the arguments by the name of a function.
 Prototypes = Mapping[str, tuple[Any, Sequence[Any]]]
-
-
-@dataclass(frozen=True, slots=True)
-class VendorLibrary:
-    """Where a vendor's library may be.
-
-    Parameters
-    ----------
-    title
-        Display name, such as "ALPAO SDK".
-    default
-        File names for the system's loader, the preferred one first.
-    variable
-        Environment variable that may hold a path.
-    source
-        Where the library comes from, for the message when it is missing.
-    """
-
-    title: str
-    default: tuple[str, ...]
-    variable: str
-    source: str
-
-    def load(self, device: str, path: str = "") -> ctypes.CDLL:
-        """Load the library from ``path``, the path in the environment or a default name."""
-        chosen = path or os.environ.get(self.variable, "")
-        failures = []
-        for name in (chosen,) if chosen else self.default:
-            try:
-                return ctypes.CDLL(name)
-            except OSError as error:
-                failures.append(str(error))
-        raise DeviceError(
-            device,
-            f"the library of the {self.title} cannot be loaded ({'; '.join(failures)}); {self.source}, then "
-            f"name its file in the option 'library' of the device or in {self.variable}",
-        )
 
 
 class LoadedLibrary:
@@ -88,7 +49,15 @@ class LoadedLibrary:
 
     def __init__(self, device: str, path: str = "") -> None:
         self.device = device
-        self.c = self.VENDOR.load(device, path)
+        vendor = self.VENDOR
+        try:
+            self.c = vendor.load(path)
+        except OSError as error:
+            raise DeviceError(
+                device,
+                f"the library of the {vendor.title} cannot be loaded ({error}); {vendor.source}, then "
+                f"name its file in the option 'library' of the device or in {vendor.variable}",
+            ) from error
         missing = [name for name in self.PROTOTYPES if not hasattr(self.c, name)]
         if missing:
             loaded_as = vars(self.c).get("_name", "the library")

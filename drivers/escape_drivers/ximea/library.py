@@ -9,7 +9,8 @@ import ctypes
 from ctypes import POINTER, c_char_p, c_double, c_float, c_int, c_uint32, c_void_p
 from typing import Any
 
-from escape_drivers.common.vendor_library import LoadedLibrary, Prototypes, VendorLibrary
+from escape_drivers.common.vendor_library import LoadedLibrary, Prototypes
+from escape_hw.api.discovery import VendorLibrary
 from escape_hw.errors import DeviceError
 
 _RECONNECT_HINT = "check cable and power, then open the camera again"

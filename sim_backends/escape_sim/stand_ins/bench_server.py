@@ -13,16 +13,13 @@ from __future__ import annotations
 import contextlib
 import enum
 import logging
-import os
 import shutil
 import socket
 import struct
 import tempfile
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, Self
 
 import numpy as np
@@ -155,9 +152,7 @@ class StandInBenchServer:
         self.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *exception: object) -> None:
         self.stop()
 
     def _accept(self) -> None:
@@ -278,18 +273,3 @@ def _receive_exactly(connection: socket.socket, length: int) -> bytes | None:
             return None
         parts += part
     return bytes(parts)
-
-
-@contextmanager
-def stand_in_environment(server: StandInBenchServer) -> Iterator[None]:
-    """Set the environment variables of a bench in this process."""
-    before = {key: os.environ.get(key) for key in server.environment}
-    os.environ.update(server.environment)
-    try:
-        yield
-    finally:
-        for key, value in before.items():
-            if value is None:
-                del os.environ[key]
-            else:
-                os.environ[key] = value

@@ -85,11 +85,6 @@ class AsmController:
         """Contaminated or disabled actuators."""
         return self.contaminated | self.disabled
 
-    @property
-    def is_changing_state(self) -> bool:
-        """Whether a state transition is in progress."""
-        return self._transition is not None
-
     def request_state(self, wanted: ShellState, now: float) -> tuple[int, str]:
         """Start a state transition; returns result code and message."""
         state = self.shell.state
