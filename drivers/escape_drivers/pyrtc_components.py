@@ -46,13 +46,7 @@ _lock = threading.Lock()
 
 
 def shared_bench(conf: dict[str, Any]) -> Bench:
-    """The bench of a component's section; sections that agree share one. Its devices are not open.
-
-    Raises
-    ------
-    ConfigError
-        No system is named, or its configuration is wrong.
-    """
+    """The bench of a component's section; sections that agree share one. Its devices are not open."""
     system = str(conf.get("system") or "")
     if not system:
         raise ConfigError("system: ''  names no system of ESCAPE's; enter a name or a TOML file")
@@ -63,12 +57,6 @@ def shared_bench(conf: dict[str, Any]) -> Bench:
         if key not in _benches:
             _benches[key] = Bench.from_config(load_system(system, overrides=overrides, mode=mode))
         return _benches[key]
-
-
-def clear_shared_benches() -> None:
-    """Make new benches for the components that come; those in use go on with theirs."""
-    with _lock:
-        _benches.clear()
 
 
 class EscapeCamera(WavefrontSensor):  # type: ignore[misc]  # pyRTC is not typed

@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from escape_gui.replay.streams import main_calibration, recorded_streams
-from escape_hw.api.outlines import outlines
 from escape_hw.errors import ConfigError
 from escape_hw.remote.source import STREAMS, Sample
 from escape_hw.remote.state import (
@@ -137,7 +136,7 @@ def _geometry_of(run: RunContent) -> Geometry:
     if main is not None:
         grid = main[1].grid
         parts |= {
-            "valid": _rows(grid.valid), "outlines_px": outlines(grid), "n_modes": main[1].matrix.n_modes,
+            "valid": _rows(grid.valid), "outlines_px": grid.outlines(), "n_modes": main[1].matrix.n_modes,
         }  # fmt: skip
     if run.layout is not None:
         parts["layout"] = _rows(run.layout)

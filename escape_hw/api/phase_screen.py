@@ -15,7 +15,7 @@ from escape_hw.errors import SettingRejected
 
 @dataclass(frozen=True, slots=True)
 class ScreenState:
-    """State of a phase screen: number from 0, whether it is in the beam, speed across the pupil.
+    """State of a phase screen: number from 0, whether it is in the beam, speed across the pupil (0: stopped).
 
     ``blocked`` is true while a beam stop is inserted, for dark frames.
     """
@@ -66,23 +66,7 @@ class PhaseScreen(Device):
         speed_m_s: float | None = None,
         blocked: bool | None = None,
     ) -> ScreenState:
-        """Change the given values and keep the others.
-
-        Parameters
-        ----------
-        screen
-            Number of the screen, counted from 0.
-        inserted
-            Whether the screen is in the beam.
-        speed_m_s
-            Speed across the pupil in metres per second, 0 to stop it.
-        blocked
-            Whether the beam stop is inserted.
-
-        Returns
-        -------
-        ScreenState
-            The state reached.
+        """Change the given values, see :class:`ScreenState`, and keep the others; returns the state reached.
 
         Raises
         ------

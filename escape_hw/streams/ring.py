@@ -156,7 +156,7 @@ class RingReader:
         return None
 
     def wait(self, after: int, timeout_s: float) -> bool:
-        """Wait until :attr:`written` differs from ``after``; false after the time-out or the end of the ring."""
+        """Wait until :attr:`written` differs from ``after``; false after the time-out or at its end."""
         until = time.monotonic() + timeout_s
         while self.written == after and not self.closed:
             left = until - time.monotonic()

@@ -113,7 +113,7 @@ def test_acknowledgements_bring_positions_and_times() -> None:
     with emulator() as made, driver(port_of(made)) as mirror:
         shape = 0.02 * _enabled(mirror)
         mirror.send(shape)
-        ack = mirror.last_ack
+        ack = mirror._ack
         assert ack is not None
         assert ack.result is m.Result.APPLIED
         assert 0 < ack.received_ns <= ack.applied_ns

@@ -107,11 +107,6 @@ class AlpaoMirror(DeformableMirror):
         return self._info
 
     @property
-    def is_playing(self) -> bool:
-        """True after :meth:`play_patterns`, until the next command or :meth:`stop_pattern`."""
-        return self._playing
-
-    @property
     def handle(self) -> c_void_p:
         """The SDK's handle, for calls that this driver does not make; raises ``NotOpen`` when closed."""
         self.require_open()
@@ -150,29 +145,10 @@ class AlpaoMirror(DeformableMirror):
             self._shape_known = False
 
     def stop_pattern(self) -> None:
-        """Stop a sequence; the mirror keeps the shape it has. Does nothing when none runs.
-
-        Raises
-        ------
-        NotOpen, DeviceError
-            The mirror is not connected, or did not stop.
-        """
+        """Stop a sequence; the mirror keeps the shape it has. Does nothing when none runs."""
         with self._lock:
             self._guard_when_open()
             self._stop_playing()
-
-    def parameter(self, name: str) -> float:
-        """Read a parameter of the SDK, such as ``"ItfState"``.
-
-        Raises
-        ------
-        NotOpen, DeviceError
-            The mirror is not connected, or the parameter does not exist.
-        """
-        with self._lock:
-            self.require_open()
-            library, handle = self._require_connected()
-            return library.get(handle, name)
 
     def _open(self) -> None:
         if self._options.config_folder:

@@ -153,11 +153,6 @@ class AsmMirror(AdaptiveSecondary):
         """Identity and geometry."""
         return self._info
 
-    @property
-    def last_ack(self) -> m.Ack | None:
-        """The last acknowledgement: result, times on the mirror's clock, measured positions in metres."""
-        return self._ack
-
     def parameter(self, key: str) -> float:
         """One of the mirror's own parameters, such as ``telemetry_hz``; ``DeviceError`` if it has none."""
         return self._parameter(m.GetParam(key))

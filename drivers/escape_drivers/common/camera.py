@@ -55,15 +55,7 @@ class CameraClock:
         self._offset: int | None = None
 
     def exposed_ns(self, stamp_ns: int, arrived_ns: int) -> int:
-        """When a frame was exposed.
-
-        Parameters
-        ----------
-        stamp_ns
-            The camera's time stamp; 0: it gives none.
-        arrived_ns
-            Monotonic time of its arrival.
-        """
+        """When a frame was exposed, from the camera's time stamp (0: it gives none) and the arrival."""
         if stamp_ns == 0:
             return arrived_ns
         offset = arrived_ns - stamp_ns
@@ -92,18 +84,8 @@ class BlockingCamera(Camera, Generic[C]):
     """A camera read through a blocking call, which is made in short slices.
 
     Drivers fill in ``_start_acquisition``, ``_stop_acquisition`` and ``_read_frame`` in place of ``_start``,
-    ``_stop`` and ``_next_frame``; they exclude each other. ``_open`` sets ``_connection``.
-
-    Parameters
-    ----------
-    name
-        Key in ``[devices]``.
-    section
-        Serial number, sensor, region, exposure and rate to begin with.
-    kind
-        Kind of camera, until the device reports its model.
-    counter
-        First and last number of its frame counter.
+    ``_stop`` and ``_next_frame``; they exclude each other. ``_open`` sets ``_connection``. ``kind`` names the
+    camera until it reports its model; ``counter`` has the first and last number of its frame counter.
     """
 
     def __init__(self, name: str, section: CameraConfig, kind: str, counter: tuple[int, int]) -> None:

@@ -37,10 +37,6 @@ class AsmController:
 
     Parameters
     ----------
-    shell
-        The shell.
-    limits
-        Limits of the mirror itself.
     contaminated
         Actuators that the mirror has taken out of service.
     speed

@@ -248,11 +248,8 @@ class WaveGenerators:
 
     def output(self, args: Sequence[str]) -> str:
         """``CTO?``."""
-        pairs = (
-            [(parse_integer(a), parse_integer(b)) for a, b in group_arguments(args, 2)]
-            if args
-            else sorted(self.outputs)
-        )
+        groups = group_arguments(args, 2) if args else []
+        pairs = [(parse_integer(a), parse_integer(b)) for a, b in groups] or sorted(self.outputs)
         if any(pair not in self.outputs for pair in pairs) or not pairs:
             raise GcsCommandError(17)
         return format_lines(
