@@ -65,14 +65,8 @@ class EscapeCamera(WavefrontSensor):  # type: ignore[misc]  # pyRTC is not typed
     Parameters
     ----------
     conf
-        The section ``wfs``; ``width`` and ``height`` are those of the region that the system reads.
-
-    Raises
-    ------
-    ConfigError
-        The system is wrong, or reads another region.
-    DeviceError
-        The camera cannot be opened.
+        The section ``wfs``; ``width`` and ``height`` are those of the region that the system reads, else
+        ``ConfigError`` is raised.
     """
 
     EXTRA_CONFIG_KEYS = _KEYS
@@ -119,14 +113,7 @@ class EscapeMirror(WavefrontCorrector):  # type: ignore[misc]  # pyRTC is not ty
     Parameters
     ----------
     conf
-        The section ``wfc``.
-
-    Raises
-    ------
-    ConfigError
-        The system is wrong, or its mirror has another number of actuators.
-    DeviceError
-        The mirror cannot be opened.
+        The section ``wfc``; ``num_actuators`` is that of the system, else ``ConfigError`` is raised.
     """
 
     EXTRA_CONFIG_KEYS = _KEYS

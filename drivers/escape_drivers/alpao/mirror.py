@@ -73,13 +73,7 @@ class AlpaoOptions(Section):
 
 
 def make_mirror(name: str, config: SystemConfig, shared: dict[str, object]) -> AlpaoMirror:
-    """Entry point ``alpao``.
-
-    Raises
-    ------
-    ConfigError
-        The serial number is missing, or an option is unknown.
-    """
+    """Entry point ``alpao``; raises ``ConfigError`` if the serial number is missing or an option is wrong."""
     section = config.devices.dm
     require_serial(name, section)
     options = parse_options(AlpaoOptions, name, section)

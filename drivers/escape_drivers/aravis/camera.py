@@ -65,13 +65,7 @@ class AravisOptions(Section):
 
 
 def make_camera(name: str, config: SystemConfig, shared: dict[str, object]) -> AravisCamera:
-    """Entry point ``aravis``.
-
-    Raises
-    ------
-    ConfigError
-        The camera or its serial number is missing, or an option is unknown.
-    """
+    """Entry point ``aravis``; raises ``ConfigError`` if the serial number is missing or an option wrong."""
     section = camera_section(name, config)
     require_serial(name, section)
     return AravisCamera(name, section, parse_options(AravisOptions, name, section))

@@ -227,9 +227,11 @@ def _decode_reply(kind: int, payload: bytes) -> m.Reply:
 
 def _read_reply(kind: int, read: _PayloadReader) -> m.Reply:
     if kind == _WELCOME:
-        echo, version, _, state, flags, n_act, token, *limits = read.unpack(_WELCOME_FIELDS)
-        identity = (echo, version, token, read.text(), bool(flags & _SIMULATED), _STATES[state])
-        return m.Welcome(*identity, *limits, *(read.indices(), read.read_floats(n_act)))
+        echo, version, _, state, flags, n_act, token, command, step, hold, rest = read.unpack(_WELCOME_FIELDS)
+        return m.Welcome(
+            echo, version, token, read.text(), bool(flags & _SIMULATED), _STATES[state], command, step, hold,
+            rest, read.indices(), read.read_floats(n_act),
+        )  # fmt: skip
     if kind == _ACK:
         echo, result, state, flags, clipped, received, applied = read.unpack(_ACK_FIELDS)
         positions = read.read_floats((len(read.payload) - read.offset) // 4)
@@ -242,9 +244,13 @@ def _read_reply(kind: int, read: _PayloadReader) -> m.Reply:
         echo, state = read.unpack(_DONE_FIELDS)
         return m.Done(echo, _STATES[state], read.text())
     if kind == _HEALTH:
-        echo, state, *numbers = read.unpack(_HEALTH_FIELDS)
-        contaminated, owner, fault = read.indices(), read.text(), read.text()
-        return m.HealthReport(echo, _STATES[state], *numbers, *(contaminated, owner, fault))
+        (
+            echo, state, time_ns, gap, current, warmest, coolant, humidity, dew, applied, skipped, crc_errors,
+        ) = read.unpack(_HEALTH_FIELDS)  # fmt: skip
+        return m.HealthReport(
+            echo, _STATES[state], time_ns, gap, current, warmest, coolant, humidity, dew, applied, skipped,
+            crc_errors, read.indices(), read.text(), read.text(),
+        )  # fmt: skip
     if kind == _PARAM:
         echo, value = read.unpack(_PARAM_FIELDS)
         return m.Param(echo, read.text(), value)

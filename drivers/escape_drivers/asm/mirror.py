@@ -92,13 +92,7 @@ _STEP_POLL_S = 0.02
 
 
 def make_asm(name: str, config: SystemConfig, shared: dict[str, object]) -> AsmMirror:
-    """Entry point ``asm``.
-
-    Raises
-    ------
-    ConfigError
-        No serial number, or an option is wrong.
-    """
+    """Entry point ``asm``; raises ``ConfigError`` if the serial number is missing or an option is wrong."""
     section = config.devices.dm
     require_serial(name, section)
     options = parse_options(AsmOptions, name, section)

@@ -89,13 +89,7 @@ _UNREACHABLE_NOTE = (
 
 
 def make_modulator(name: str, config: SystemConfig, shared: dict[str, object]) -> PiModulator:
-    """Entry point ``pi-e727``.
-
-    Raises
-    ------
-    ConfigError
-        The system has no modulator.
-    """
+    """Entry point ``pi-e727``; raises ``ConfigError`` if the system has no modulator."""
     section = config.devices.modulator
     if section is None:
         raise ConfigError(f"system {config.system.name!r} has no [devices.modulator] section")

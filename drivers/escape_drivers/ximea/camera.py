@@ -106,13 +106,7 @@ class XimeaOptions(Section):
 
 
 def make_camera(name: str, config: SystemConfig, shared: dict[str, object]) -> XimeaCamera:
-    """Entry point ``ximea``.
-
-    Raises
-    ------
-    ConfigError
-        The camera or its serial number is missing, or an option is unknown.
-    """
+    """Entry point ``ximea``; raises ``ConfigError`` if its serial number is missing or an option is wrong."""
     section = camera_section(name, config)
     require_serial(name, section)
     return XimeaCamera(name, section, parse_options(XimeaOptions, name, section))
