@@ -10,7 +10,7 @@ from collections.abc import Callable, Generator, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from types import FrameType
-from typing import Protocol, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,13 +70,8 @@ class Progress:
         return self.elapsed_s * max(0, self.total - self.done) / self.done
 
 
-class StopSignal(Protocol):
-    """Request to stop: a :class:`SignalSafeFlag` or a :class:`threading.Event`."""
-
-    def is_set(self) -> bool:
-        """Whether stopping was requested."""
-
-
+#: Request to stop.
+StopSignal = SignalSafeFlag | threading.Event
 Procedure = Generator[Progress, None, T]
 Observer = Callable[[Progress], None]
 

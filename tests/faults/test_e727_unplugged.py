@@ -7,6 +7,7 @@ import time
 
 import pytest
 import usb.core
+from usb_bus import VENDOR, UsbBackend, UsbPipe
 
 from escape_drivers.pi.modulator import PiModulator
 from escape_drivers.pi.transports import SerialTransport, TransportLost, UsbTransport
@@ -15,8 +16,7 @@ from escape_hw.config.loader import load_system
 from escape_hw.errors import DeviceLost
 from escape_sim.emulators.e727.controller import E727Controller
 from escape_sim.emulators.e727.state import ControllerSettings
-from escape_sim.emulators.e727.transports import FaultInjector, PtyServer, UsbPipe
-from escape_sim.emulators.e727.usb_backend import VENDOR, UsbBackend
+from escape_sim.emulators.e727.transports import FaultInjector, PtyServer
 
 CIRCLE = Modulation(1.41e-4, 303.03)
 LONGEST_S = 10.0

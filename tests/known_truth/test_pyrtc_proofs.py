@@ -102,9 +102,10 @@ def test_a_matrix_of_ours_closes_pyrtcs_loop(tmp_path: Path, command: Callable[.
 
 def measured_by_pyrtc(folder: Path, geometry: CalibrationResult, seed: int) -> Path:
     """pyRTC's push-pull through turbulence on our twin; returns its configuration."""
-    from escape_drivers.pyrtc_components import EscapeCamera, EscapeMirror, clear_shared_benches
+    from escape_drivers import pyrtc_components
+    from escape_drivers.pyrtc_components import EscapeCamera, EscapeMirror
 
-    clear_shared_benches()
+    pyrtc_components._benches.clear()
     paths = export_matrix(folder, geometry, FrameSettings((200, 200), 12.0))
     found = sections(paths["settings"])
     ours = {"system": "razor-shwfs", "set": [*TWIN, f"system.seed={seed}"]}

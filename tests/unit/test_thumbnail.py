@@ -20,7 +20,7 @@ from escape_hw.remote.state import FaultState, LoopState, Phase, State
 
 def pixels(html: str) -> np.ndarray:
     data = base64.b64decode(re.search(r"base64,([^\"]+)", html)[1])
-    return np.round(255 * matplotlib.image.imread(io.BytesIO(data), "png")).astype(int)
+    return np.round(255 * matplotlib.image.imread(io.BytesIO(data), "png")[..., :3]).astype(int)
 
 
 def matrix() -> InteractionMatrix:

@@ -113,7 +113,7 @@ def test_acknowledgements_bring_positions_and_times() -> None:
     with emulator() as made, driver(port_of(made)) as mirror:
         shape = 0.02 * _enabled(mirror)
         mirror.send(shape)
-        ack = mirror.last_ack
+        ack = mirror._ack
         assert ack is not None
         assert ack.result is m.Result.APPLIED
         assert 0 < ack.received_ns <= ack.applied_ns
@@ -234,10 +234,10 @@ def test_new_contamination_is_reported_with_the_line_to_configure() -> None:
     ("word", "message"),
     [
         ("hots=x", "did you mean 'host'"),
-        ("port=0", "allowed range 1 to 65535"),
-        ("reply_s=-1.0", "reply_s: -1  is out of range"),
+        ("port=0", "allowed range 1 <= x <= 65535"),
+        ("reply_s=-1.0", "reply_s: -1.0  is out of range"),
         ("max_skips=0", "max_skips: 0  is out of range"),
-        ("lift=1", "type bool"),
+        ("lift=1", "must be a valid boolean"),
     ],
 )
 def test_wrong_options_are_refused(word: str, message: str) -> None:

@@ -7,6 +7,7 @@ import time
 
 import numpy as np
 import pytest
+from usb_bus import pulses_s
 
 from escape_drivers.pi.modulator import PiModulator, make_modulator
 from escape_hw.api.emulator import EmulatorRequest
@@ -96,7 +97,7 @@ def test_a_circle_is_written_started_at_once_and_triggered(emulator):
             "WSL 1 1 2 2", "WGC 1 0 2 0", "WOS 1 0 2 0", "WTR 1 1 0 2 1 0", "MOV 1 1141 2 1000",
             "TWC", "TWS 1 1 1", "TWS 1 34 0", "CTO 1 3 4", "WGO 1 1 2 1",
         )  # fmt: skip
-        assert emulator.controller.waves.pulses_s(1, "1") == pytest.approx([0.0])
+        assert pulses_s(emulator.controller, 1, "1") == pytest.approx([0.0])
         stage.park()
         assert emulator.controller.state.describe() == "servo on"
     assert emulator.violations == ()

@@ -87,8 +87,9 @@ class GainsProcedure(MatrixProcedure["GainsRun"]):
         return (
             yield from bootstrap_gains(
                 bench, self.product.result, poke=self.poke, accuracy=self.accuracy,
-                allowed_strehl_loss=self.allowed_strehl_loss, frames=self.frames, gain=self.gain, comparisons=comparisons,
-                closed_loop_matrix=static_light_matrix(bench, self.product.result), model_psf=model,
+                allowed_strehl_loss=self.allowed_strehl_loss, frames=self.frames, gain=self.gain,
+                comparisons=comparisons, closed_loop_matrix=static_light_matrix(bench, self.product.result),
+                model_psf=model,
             )
         )  # fmt: skip
 
