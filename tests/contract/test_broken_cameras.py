@@ -1,4 +1,4 @@
-"""Every check on cameras fails on a camera that breaks just what it checks."""
+"""Every check on cameras fails on a camera that violates only the checked rule."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Every general check fails on a device that breaks just what it checks."""
+"""Every general check fails on a device that violates only the checked rule."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Every check on mirrors fails on a mirror that breaks just what it checks."""
+"""Every check on mirrors fails on a mirror that violates only the checked rule."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def unguarded(self: Any, command: Any) -> Any:
 
 
 def knocks_first(self: Any, command: Any) -> Any:
-    """Send what was asked for, and a moment later what the guard made of it."""
+    """Send the requested command, then the one limited by the guard."""
     self.require_open()
     self._send(np.real(np.asarray(command)).astype(float))
     return DeformableMirror.send(self, command)

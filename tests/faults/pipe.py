@@ -1,4 +1,4 @@
-"""A driver and an emulated E-727 in one process, on a wire without delays and a clock that hurries."""
+"""A driver and an emulated E-727 in one process, without delays and with an accelerated clock."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``escape emulate``: lists, serves, reports protocol violations, and says where it listens."""
+"""``escape emulate``: lists, serves, reports protocol violations, and prints its address."""
 
 from __future__ import annotations
 

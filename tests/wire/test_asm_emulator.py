@@ -1,4 +1,4 @@
-"""The emulated adaptive secondary is strict: what a careless client does is refused and written down."""
+"""The emulated adaptive secondary is strict: violations of a client are refused and recorded."""
 
 from __future__ import annotations
 

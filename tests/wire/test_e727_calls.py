@@ -1,4 +1,4 @@
-"""What the driver says to the controller, call by call: order, units, values."""
+"""Commands of the driver to the controller: order, units, values."""
 
 from __future__ import annotations
 
@@ -170,7 +170,7 @@ def test_axes_may_be_crossed_reversed_and_weak(emulator):
         assert tables[2] == pytest.approx(1000 + 200 * np.sin(angle))
 
 
-def test_looking_at_a_closed_stage_moves_nothing(emulator):
+def test_status_of_a_closed_stage_moves_nothing(emulator):
     stage = driver(emulator)
     status = stage.status()
     assert said(emulator) == ["ERR?"]

@@ -1,4 +1,4 @@
-"""The emulated E-727 is strict: it obeys its manual, and tells what a careless client does."""
+"""The emulated E-727 is strict: it follows its manual, and reports violations."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ def test_auto_zero_takes_its_time_and_the_full_range():
     assert client.say("ATZ? 1") == "1=1\n"
 
 
-def test_a_failed_auto_zero_says_so():
+def test_a_failed_auto_zero_is_reported():
     client = Client(zeroed=False)
     client.controller.state.axes["1"].zero_failed = True
     assert client.error("ATZ 1 NaN") == 0
@@ -120,7 +120,7 @@ def test_a_failed_auto_zero_says_so():
     assert client.say("ERR?") == "98\n"
 
 
-def test_errors_have_to_be_asked_for(client):
+def test_errors_have_to_be_requested(client):
     client.say("SVO 1 1")
     client.say("SVO 2 1")
     assert client.violations == ["no ERR? after 'SVO 1 1' (then: 'SVO 2 1')"]
@@ -192,7 +192,7 @@ def test_a_start_far_from_the_first_point_is_a_jump(servo):
     assert servo.violations == ["WGO 1 starts with a jump of 400.0 urad; MOV there first"]
 
 
-def test_a_turning_axis_takes_no_other_orders(servo):
+def test_a_turning_axis_accepts_no_other_commands(servo):
     circle(servo)
     assert servo.error("WGO 1 1 2 1") == 0
     for command in ("MOV 1 1000", "SVO 1 0", "WSL 1 2", "WAV 1 X PNT 1 1 5", "WCL 1", "WGO 1 1"):

@@ -1,4 +1,4 @@
-"""Real drivers on the simulated bench: what they measure is what the twin's own devices measure."""
+"""Real drivers on the simulated bench: the same measurements as with the twin's devices."""
 
 from __future__ import annotations
 

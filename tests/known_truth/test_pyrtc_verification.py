@@ -1,4 +1,4 @@
-"""Two proofs with pyRTC itself: our matrix closes its loop, and SPRINT betters a matrix that it measured."""
+"""Two tests with pyRTC: ESCAPE's matrix closes its loop, and SPRINT improves a matrix measured by pyRTC."""
 
 from __future__ import annotations
 
@@ -152,6 +152,6 @@ def test_a_matrix_measured_by_pyrtc_is_improved_by_sprint(
     found = {name: value["value"] for name, value in told["registration"].items()}
     print(f"pyRTC's push-pull {errors['im']:.3f}, SPRINT's matrix {errors['escape']:.3f}; {found}")
     assert errors["escape"] < 0.5 * errors["im"]
-    planted = escape_hw.load_system("razor-shwfs").twin.registration
-    assert abs(found["shift_x"] - planted.shift_x) < 15
-    assert abs(found["shift_y"] - planted.shift_y) < 15
+    injected = escape_hw.load_system("razor-shwfs").twin.registration
+    assert abs(found["shift_x"] - injected.shift_x) < 15
+    assert abs(found["shift_y"] - injected.shift_y) < 15

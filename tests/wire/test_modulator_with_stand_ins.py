@@ -1,4 +1,4 @@
-"""The real drivers of a pyramid's bench, its modulator's too, on the simulated bench."""
+"""The real drivers of a pyramid bench, including the modulator's, on the simulated bench."""
 
 from __future__ import annotations
 
