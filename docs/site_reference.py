@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -12,9 +13,9 @@ import typer.main
 from escape_hw.cli.app import app
 from escape_hw.config.templates import json_schema
 
-#: Where the pages go, inside the documentation's folder; made anew with every build.
+#: Folder of the pages inside the documentation; not tracked, written by every build.
 FOLDER = "reference/_generated"
-#: What a schema's types are called here.
+#: Words for the types of a schema.
 _WORDS = {
     "number": "number",
     "integer": "whole number",
@@ -25,9 +26,17 @@ _WORDS = {
 
 
 def write_pages(docs: Path) -> None:
-    """Write every page; one whose text has not changed is left alone, so that builds stay quick."""
+    """Write every page whose text has changed, and remove autosummary's pages of names no longer listed.
+
+    A page of a name that was removed or renamed would be read by every later build, with warnings.
+    """
     folder = docs / FOLDER
     folder.mkdir(parents=True, exist_ok=True)
+    api = (docs / "reference" / "api.md").read_text(encoding="utf-8")
+    listed = set(re.findall(r"^   (\w+)$", api, re.MULTILINE))
+    for page in folder.glob("*.rst"):
+        if page.stem.removeprefix("escape_hw.") not in listed:
+            page.unlink()
     for name, text in (
         ("configuration.md", "\n".join(configuration_page())),
         ("command-line.md", command_line_page()),
@@ -101,14 +110,7 @@ def _allowed(value: dict[str, Any]) -> str:
 
 
 def _range(one: dict[str, Any]) -> str:
-    words = {
-        "number": "number",
-        "integer": "whole number",
-        "string": "text",
-        "boolean": "true, false",
-        "array": "list",
-    }
-    text = words.get(str(one.get("type")), "")
+    text = _WORDS.get(str(one.get("type")), "")
     low, high = (
         one.get("exclusiveMinimum", one.get("minimum")),
         one.get("exclusiveMaximum", one.get("maximum")),
