@@ -4,9 +4,9 @@
     python benchmarks/studies/capture_range.py --system razor-pywfs --realisations 100 --out docs/figures
 
 Each realisation is a twin with all its imperfections, measured by push-pull without turbulence, two frames
-per sign. SPRINT gets that matrix and a model built on the images found, and starts from zero. A realisation
-is recovered when SPRINT reports convergence and every parameter is right within the tolerance, flagged when
-it reports none, and wrong otherwise. Writes ``capture-SYSTEM.jsonl``: appends one line per realisation;
+per sign. SPRINT gets that matrix and a model built on the located images, and starts from zero. A realisation
+is recovered if SPRINT reports convergence and every parameter is within the tolerance, flagged if
+it does not, and wrong otherwise. Writes ``capture-SYSTEM.jsonl``: appends one line per realisation;
 realisations already in the file are skipped. Exits with 1 when a realisation was wrong or fewer than 95 in
 100 were recovered. A realisation takes five seconds on an idle core, on a pyramid twenty.
 """

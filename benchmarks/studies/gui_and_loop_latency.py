@@ -1,9 +1,9 @@
-"""What a window does to the loop beside it: latency with the window alive and with it halted, in turn.
+"""Effect of a window on the loop: latency with the window running and with it halted, alternately.
 
 A server of ``razor-shwfs`` on the twin, which loses no frames here, closes its loop on a short DO-CRIME.
-A window on it is halted and let go every few seconds, so that whatever else the machine does falls on both
-alike. Printed are the ratios of the medians over all turns, and the 16th and 84th percentile of a bootstrap
-over pairs of turns: where 1 lies between them the window is within noise.
+A window connected to it is halted and resumed every few seconds, so that other load of the machine affects
+both equally. Prints the ratios of the medians over all turns, and the 16th and 84th percentile of a bootstrap
+over pairs of turns: where 1 lies between them, the effect of the window is within the noise.
 ``python benchmarks/studies/gui_and_loop_latency.py [TURNS]``.
 """
 

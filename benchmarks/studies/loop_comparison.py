@@ -4,10 +4,10 @@ alone.
     python benchmarks/studies/loop_comparison.py --seeds 1 2 3 4 5 6 7 8 9 10 --out paired
 
 Each seed is a twin with a mirror and turbulence of its own. Every matrix is closed at its own best gain,
-found on the first seconds of that turbulence, and judged on later ones, the same for all three. Matrices and
-loops are kept in a folder as soon as they are done and are not made again; with ``--minutes 4`` nothing new
-is begun after four minutes, and the next call goes on. Prints the table of the seeds that are finished, with
-the differences paired by seed. A seed of the pyramid bench takes some six minutes on an idle core.
+found on the first seconds of that turbulence, and evaluated on later ones, the same for all three. Matrices
+and loops are saved in a folder and are not repeated; with ``--minutes 4`` nothing new is started after four
+minutes, and the next call continues. Prints the table of the finished seeds, with the differences paired by
+seed. A seed of the pyramid bench takes some six minutes on an idle core.
 """
 
 from __future__ import annotations
@@ -35,18 +35,18 @@ from escape_hw.runtime.session.system import System, open_system
 from escape_sim.devices.true_optical_gains import get_simulated_bench
 
 ESCAPE, BASELINE, DOCRIME = "ESCAPE with optical gains", "push-pull", "DO-CRIME alone"
-#: Start times of judged loops and bootstrap on the twin's clock, each after the previous turbulence.
+#: Start times of evaluated loops and bootstrap on the twin's clock, each after the previous turbulence.
 EVALUATION_START_S, BOOTSTRAP_START_S = 4.0, 10.0
 #: Gains tried, relative to the usual one in effect; the best at an end is followed one further.
 FACTORS, BELOW, ABOVE = (0.85, 1.0, 1.2), 0.7, 1.4
 
 
 class TimeBudgetExceeded(Exception):
-    """It is time to begin nothing new."""
+    """No new measurement may start."""
 
 
 class SeedRun:
-    """One twin: its matrices and loops, kept in a folder.
+    """One twin: its matrices and loops, saved in a folder.
 
     Parameters
     ----------
@@ -55,7 +55,7 @@ class SeedRun:
     number
         The seed.
     until
-        Time of the monotonic clock after which nothing is begun.
+        Time of the monotonic clock after which nothing is started.
     """
 
     def __init__(self, options: argparse.Namespace, number: int, until: float) -> None:
@@ -66,13 +66,13 @@ class SeedRun:
         self._records: dict[str, dict[str, Any]] = {row["what"]: row for row in read_lines(self._lines)}
 
     def open_bench(self) -> System:
-        """A bench in its first state: what is done on it does not depend on what was done before."""
+        """Open a bench in its initial state, so that results do not depend on earlier measurements."""
         if time.monotonic() > self._until:
             raise TimeBudgetExceeded
         return open_system(self.options.system, seed=self.number, set=self.options.set)
 
     def matrix(self, name: str, make: Callable[[System], CalibrationResult]) -> CalibrationResult:
-        """A matrix, made unless it is kept."""
+        """A matrix, measured unless it is saved already."""
         path = self._folder / f"{name}.fits"
         if not path.exists():
             with self.open_bench() as bench:
@@ -88,14 +88,14 @@ class SeedRun:
         return np.asarray(np.load(path))
 
     def get_or_measure(self, what: str, make: Callable[[System], dict[str, Any]]) -> dict[str, Any]:
-        """A line of the book, made unless it is kept."""
+        """A record, measured unless it is saved already."""
         if what not in self._records:
             with self.open_bench() as bench:
                 self.add_record(what, make(bench))
         return self._records[what]
 
     def add_record(self, what: str, found: dict[str, Any]) -> None:
-        """Write a line into the book."""
+        """Save a record."""
         self._records[what] = {"what": what, **found}
         append_line(self._lines, self._records[what])
         print(f"seed {self.number}: {json.dumps(self._records[what])}", flush=True)
@@ -166,7 +166,7 @@ def evaluate_matrices(seed: SeedRun) -> dict[str, tuple[float, float]]:
     """Strehl ratio in % of each matrix at its own best gain, and that gain relative to the usual one."""
     each, found, options = matrices(seed), {}, seed.options
     for name, result in each.items():
-        # Gains that are alike in their effect, whatever the matrix's scale.
+        # Gains of equal effect, independent of the scale of the matrix.
         share = float(np.median(result.matrix.data.std(0) / each[ESCAPE].matrix.data.std(0)))
         one = partial(closed_loop_strehl, seed, name, result, share)
         scan = {factor: one(factor, options.scan, 0.0) for factor in FACTORS}
@@ -194,18 +194,18 @@ def table(found: dict[int, dict[str, tuple[float, float]]]) -> list[str]:
 
 
 def main() -> None:
-    """Measure what is missing, and print what there is."""
+    """Measure what is missing, and print the table."""
     parser = study_parser(__doc__, "razor-pywfs")
     parser.add_argument("--set", nargs="*", default=[])
     parser.add_argument("--seeds", nargs="+", type=int, default=list(range(1, 11)))
     parser.set_defaults(out=Path("paired"))
-    parser.add_argument("--minutes", type=float, default=np.inf, help="begin nothing after so long")
+    parser.add_argument("--minutes", type=float, default=np.inf, help="start nothing new after this time")
     parser.add_argument("--calibration", type=int, default=1500, help="frames of ESCAPE")
     parser.add_argument("--baseline", type=int, default=20, help="push-pull: frames per push and per pull")
     parser.add_argument("--frames", type=int, default=1200, help="frames per round of the bootstrap, at most")
     parser.add_argument("--accuracy", type=float, default=0.06, help="of the gains")
-    parser.add_argument("--scan", type=int, default=400, help="frames of each loop that looks for the gain")
-    parser.add_argument("--loop", type=int, default=1200, help="frames of each loop that is judged")
+    parser.add_argument("--scan", type=int, default=400, help="frames of each loop of the gain search")
+    parser.add_argument("--loop", type=int, default=1200, help="frames of each evaluated loop")
     options = parser.parse_args()
     until, found = time.monotonic() + 60 * options.minutes, {}
     for number in options.seeds:

@@ -1,12 +1,13 @@
-"""What turbulence alone costs a pyramid's registration: error against frames at the truth.
+"""Registration error of a pyramid due to turbulence alone, against the number of frames.
 
     python benchmarks/studies/pyramid_turbulence_limit.py --system maps-nir --frames 75 300 1500 3000
 
-Everything but gain, registration and the model's variants is known here: where the images lie, how strong the
-turbulence is, and the model is taken about the injected registration. Frames are fitted directly, by least
-squares with each slope's noise, as they are (unwhitened) and as differences of neighbours (whitened), with no
-matrix in between. What is left is noise and the states of the turbulence; the third curve is what the model
-says of these: the scatter of one state over the root of the states that were seen. Writes
+All is given except gain, registration and the model's variants: the positions of the images and the strength
+of the turbulence are known, and the model is linearised at the injected registration. Frames are fitted
+directly, without a matrix, by least squares with each slope's noise, as they are (unwhitened) and as
+differences of neighbours (whitened). The remaining error is due to noise and to the finite number of states
+of the turbulence; the third curve is the prediction of the latter: the standard deviation of one state over
+the square root of the number of states. Writes
 ``pyramid-frames-SYSTEM.json`` and ``.png``; a realisation takes some ten seconds.
 """
 

@@ -74,10 +74,10 @@ def each_realisation(
     """
     asked = json.loads(json.dumps(asked))
     target.parent.mkdir(parents=True, exist_ok=True)
-    known = read_lines(target)
-    if any(line["asked"] != asked for line in known):
-        raise SystemExit(f"{target} has realisations that were asked for otherwise; choose another --out")
-    lines = {line["realisation"]: line for line in known}
+    saved = read_lines(target)
+    if any(line["asked"] != asked for line in saved):
+        raise SystemExit(f"{target} has realisations with other settings; choose another --out")
+    lines = {line["realisation"]: line for line in saved}
     for number in numbers:
         if number not in lines:
             lines[number] = {"realisation": number, "asked": asked, **measure(number)}

@@ -52,8 +52,8 @@ def contamination_overrides(share: float) -> list[str]:
 def print_table(rows: list[Line]) -> None:
     """Print the statistics of the realisations that converged."""
     converged_rows = [row for row in rows if row["converged"]]
-    of_these = "; of these:" if converged_rows else ""
-    print(f"{len(rows)} realisations, {len(converged_rows)} converged{of_these}")
+    suffix = "; statistics of the converged realisations:" if converged_rows else ""
+    print(f"{len(rows)} realisations, {len(converged_rows)} converged{suffix}")
     if not converged_rows:
         return
     errors, sigmas = (np.array([row[key] for row in converged_rows]) for key in ("error", "sigma"))

@@ -37,7 +37,7 @@ CODES = ("ours", "OOPAO")
 #: Photons per sub-aperture and frame, about as on the bench.
 _PHOTONS = 2e4
 BEGIN, END = "<!-- scaling: begin -->", "<!-- scaling: end -->"
-#: One thread for everybody; must be set before NumPy loads.
+#: One thread for all packages; must be set before NumPy loads.
 _ONE_THREAD = {name: "1" for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")}
 
 
@@ -160,7 +160,7 @@ def campaign(folder: Path, minutes: float, limit: float, seconds: float) -> None
             if path.exists():
                 continue
             if time.monotonic() > end:
-                print("out of time; run again to go on", file=sys.stderr)
+                print("out of time; run again to continue", file=sys.stderr)
                 return
             found = run_point(point, who, limit, seconds)
             path.write_text(json.dumps({"series": point.series, "x": point.x, "who": who, **found}))

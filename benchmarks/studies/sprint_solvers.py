@@ -48,13 +48,13 @@ BAD_SUBAPERTURE_VARIANTS: dict[str, dict[str, Any]] = {
     "bad sub-apertures: registration-only": {"solver": "registration-only"},
     "bad sub-apertures: registration-only, Huber": {"solver": "registration-only", "loss": "huber"},
 }
-#: Share of sub-apertures that are spoiled, by taking the slopes of another one.
+#: Fraction of sub-apertures whose slopes are replaced by those of another one.
 _BAD = 0.03
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SolverCase:
-    """A measured matrix with what is known of it."""
+    """A measured matrix with its covariance, its model and the injected registration."""
 
     matrix: InteractionMatrix
     covariance: NDArray[np.float64] | None
@@ -72,7 +72,7 @@ def measure(system: str, number: int, frames: int) -> SolverCase:
 
 
 def with_bad_subapertures(case: SolverCase, rng: np.random.Generator) -> SolverCase:
-    """The same matrix with some sub-apertures that see another's light."""
+    """The same matrix with the slopes of some sub-apertures replaced by those of others."""
     n = case.matrix.n_slopes // 2
     bad = rng.choice(n, max(1, round(_BAD * n)), replace=False)
     seen = rng.choice(n, bad.size)
@@ -85,7 +85,7 @@ def with_bad_subapertures(case: SolverCase, rng: np.random.Generator) -> SolverC
 def solve_case(
     case: SolverCase, options: dict[str, Any]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
-    """Errors and stated errors ``(5,)`` each, and the seconds that it took."""
+    """Errors and stated errors ``(5,)`` each, and the computing time in seconds."""
     began = time.perf_counter()
     found = sprint(case.matrix, case.model, covariance=case.covariance, **options)
     seconds = time.perf_counter() - began
@@ -93,7 +93,7 @@ def solve_case(
 
 
 def table(system: str, realisations: int, frames: int, only: str = "") -> Iterator[str]:
-    """Rows of the table, as soon as they are known: the default and those whose names hold ``only``."""
+    """Yield rows of the table: the default and those whose names contain ``only``."""
     cases = [measure(system, number, frames) for number in range(realisations)]
     rng = np.random.default_rng(1)
     bad_cases = [with_bad_subapertures(case, rng) for case in cases]

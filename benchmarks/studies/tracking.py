@@ -1,15 +1,15 @@
 """Tracker on a drifting bench, compared with a loop that uses the true registration and one never updated.
 
     python benchmarks/studies/tracking.py track --seconds 600 --out tracked
-    python benchmarks/studies/tracking.py compare --loop knows --out tracked
-    python benchmarks/studies/tracking.py compare --loop never --out tracked
+    python benchmarks/studies/tracking.py compare --loop true --out tracked
+    python benchmarks/studies/tracking.py compare --loop first --out tracked
     python benchmarks/studies/tracking.py draw --out tracked --figure docs/figures/tracking.png
 
 ``track`` calibrates, finds the optical gains on a pyramid, and runs the tracker once over all frames. It
 writes its table with the twin's true values (``track.json``; ``live.jsonl`` while it runs). ``compare``
 closes another loop for a few seconds at a time, at the same moments of the same turbulence, without pokes:
-with the matrix moved to the true registration and scaled to the true gain (``knows``), or with the initial
-matrix (``never``). Intervals that its file already contains are not repeated. ``draw`` prints the
+with the matrix moved to the true registration and scaled to the true gain (``true``), or with the initial
+matrix (``first``). Intervals that its file already contains are not repeated. ``draw`` prints the
 differences and draws the figure. All take the same options.
 """
 
@@ -45,22 +45,23 @@ from escape_hw.runtime.session.system import System, open_system
 from escape_sim.devices.bench import SimBench
 from escape_sim.devices.true_optical_gains import get_simulated_bench
 
-#: Seconds of tracking that are not judged.
+#: Seconds of tracking that the statistics exclude.
 SETTLED_S = 10.0
-#: Seconds before and after an exchange that are held against each other.
+#: Seconds before and after an exchange that are compared.
 TRANSIENT_S = 0.1
-#: How far off the shift may be [% of a sub-aperture], and the Strehl ratio beside the loop that knows [%].
+#: Largest error of the shift [% of a sub-aperture], and largest loss of the Strehl ratio relative to the loop
+#: with the true registration [%].
 SHIFT_LIMIT, STREHL_LIMIT = 2.0, 1.0
-LABELS = {"knows": "knows the truth, no pokes", "never": "never looks, no pokes"}
+LABELS = {"true": "true registration, no pokes", "first": "first matrix, no pokes"}
 
 
 def read_comparison(out: Path, loop: str) -> NDArray[np.float64]:
-    """Looks at another loop so far ``(n, 3)``: end in seconds, Strehl ratio, its error."""
+    """Intervals of another loop so far ``(n, 3)``: end in seconds, Strehl ratio, its standard error."""
     return np.array(sorted(read_lines(out / f"{loop}.jsonl"))).reshape(-1, 3)
 
 
 def draw(out: Path, figure: Path) -> None:
-    """Errors in numbers, and the figure."""
+    """Print the errors and draw the figure."""
     tracked = json.loads((out / "track.json").read_text())
     rows = {name: np.array(values, float) for name, values in tracked["rows"].items()}
     truth, t = np.array(tracked["truth"]), rows["seconds"]
@@ -75,12 +76,15 @@ def draw(out: Path, figure: Path) -> None:
         )
     gains = np.array(tracked["gains"])
     gains = gains[gains[:, 0] > SETTLED_S]
-    share = np.interp(gains[:, 0], t, rows["optical_gain"]) / gains[:, 1] - 1
-    print(f"optical gain: mean error {share.mean():+.4f}, rms {np.sqrt(np.mean(share**2)):.4f},", end=" ")
-    print(f"largest {np.abs(share).max():.4f}; true {gains[:, 1].min():.3f} to {gains[:, 1].max():.3f}")
+    relative_error = np.interp(gains[:, 0], t, rows["optical_gain"]) / gains[:, 1] - 1
+    print(f"optical gain: mean error {relative_error.mean():+.4f},", end=" ")
+    print(f"rms {np.sqrt(np.mean(relative_error**2)):.4f},", end=" ")
+    print(
+        f"largest {np.abs(relative_error).max():.4f}; true {gains[:, 1].min():.3f} to {gains[:, 1].max():.3f}"
+    )
     print(exchange_transients(out, t, rows["exchanged"] > 0))
     others = {}
-    for loop in ("knows", "never"):
+    for loop in LABELS:
         comparisons = read_comparison(out, loop)
         if len(comparisons):
             others[loop] = comparisons
@@ -89,9 +93,9 @@ def draw(out: Path, figure: Path) -> None:
 
 
 def exchange_transients(out: Path, t: Any, exchanged: Any) -> str:
-    """Wavefront error in front of the sensor just after exchanges, beside that just before, and elsewhere."""
+    """Change of the wavefront error in front of the sensor at exchanges, and at other seconds."""
     ripples = np.load(out / "ripples.npz")
-    # An answer is taken up, and its matrix into use, when the second after it ends.
+    # An update, and its matrix, is applied at the end of the following second.
     edges, exchanged_here = t[1:-1], exchanged[:-2]
     at = np.searchsorted(ripples["seconds"], edges)
     span = np.searchsorted(ripples["seconds"], edges + TRANSIENT_S) - at
@@ -111,7 +115,7 @@ def exchange_transients(out: Path, t: Any, exchanged: Any) -> str:
 
 
 def at_same_times(comparisons: NDArray[np.float64], t: Any, ratios: Any) -> NDArray[np.float64]:
-    """The tracked loop's Strehl ratios at the moments of looks at another one ``(n,)``."""
+    """Strehl ratios of the tracked loop at the times of another loop's intervals ``(n,)``."""
     return np.array([ratios[np.argmin(np.abs(t - end))] for end in comparisons[:, 0]])
 
 
@@ -129,13 +133,13 @@ def difference(loop: str, comparisons: NDArray[np.float64], t: Any, ratios: Any)
 
 
 def band(panel: Any, t: Any, value: Any, sigma: Any) -> None:
-    """A course with the band of its standard errors."""
+    """Draw a time series with the band of its standard errors."""
     panel.fill_between(t, value - sigma, value + sigma, color=style.SERIES[0], alpha=0.3, lw=0)
     panel.plot(t, value, color=style.SERIES[0], lw=1.2, label="tracked")
 
 
 def picture(rows: dict[str, Any], truth: Any, gains: Any, others: dict[str, Any]) -> Figure:
-    """Shift and its error, rotation, gain, Strehl ratio and what it lacks, against time."""
+    """Shift and its error, rotation, gain, Strehl ratio and its loss, against time."""
     figure = style.new_figure(9.2, 9.0)
     panels = figure.subplots(3, 2, sharex=True).ravel()
     t = rows["seconds"]
@@ -144,17 +148,17 @@ def picture(rows: dict[str, Any], truth: Any, gains: Any, others: dict[str, Any]
         (panels[2], "rotation", 2, "rotation [deg]"),
     ):
         band(panel, t, rows[name] - truth[0, k], rows[f"{name}_sigma"])
-        panel.plot(t, truth[:, k] - truth[0, k], ":", color=style.INK, lw=1.4, label="truth")
+        panel.plot(t, truth[:, k] - truth[0, k], ":", color=style.INK, lw=1.4, label="true")
         style.style_axes(panel).set_title(f"{title}, since the start", fontsize=9.5)
     band(panels[1], t, rows["shift_x"] - truth[:, 0], rows["shift_x_sigma"])
     panels[1].axhline(0, color=style.INK, lw=0.8)
     for limit in (-SHIFT_LIMIT, SHIFT_LIMIT):
-        panels[1].axhline(limit, color=style.MUTED, lw=1.0, ls=":", label="asked for" if limit > 0 else None)
+        panels[1].axhline(limit, color=style.MUTED, lw=1.0, ls=":", label="limit" if limit > 0 else None)
     panels[1].margins(y=0.2)
-    style.style_axes(panels[1]).set_title("shift x, tracked less truth [% of a sub-aperture]", fontsize=9.5)
+    style.style_axes(panels[1]).set_title("shift x, tracked minus true [% of a sub-aperture]", fontsize=9.5)
     band(panels[3], t, rows["optical_gain"], rows["optical_gain_sigma"])
-    panels[3].plot(gains[:, 0], gains[:, 1], "o", ms=3, color=style.INK, label="truth")
-    style.style_axes(panels[3]).set_title("optical gain, beside the start's matrix", fontsize=9.5)
+    panels[3].plot(gains[:, 0], gains[:, 1], "o", ms=3, color=style.INK, label="true")
+    style.style_axes(panels[3]).set_title("optical gain, relative to the initial matrix", fontsize=9.5)
     strehl_panels(panels[4], panels[5], rows, others)
     for panel in panels:
         panel.legend(frameon=False, fontsize=8)
@@ -164,33 +168,35 @@ def picture(rows: dict[str, Any], truth: Any, gains: Any, others: dict[str, Any]
 
 
 def strehl_panels(panel: Any, deficit_panel: Any, rows: dict[str, Any], others: dict[str, Any]) -> None:
-    """Strehl ratios, and what each loop lacks of the one that knows on the same turbulence."""
+    """Strehl ratios, and their loss relative to the loop with the true registration."""
     t, ratio = rows["seconds"], np.isfinite(rows["strehl"])
     panel.errorbar(
         t[ratio], 100 * rows["strehl"][ratio], 100 * rows["strehl_sigma"][ratio],
         color=style.SERIES[0], lw=1.0, elinewidth=0.5, label="tracked, with pokes",
     )  # fmt: skip
-    known = others.get("knows")
+    reference = others.get("true")
     for (loop, comparisons), mark, colour in zip(
         others.items(), "os", (style.INK, style.SERIES[1]), strict=False
     ):
         panel.plot(comparisons[:, 0], 100 * comparisons[:, 1], mark, ms=3.5, color=colour, label=LABELS[loop])
-        if known is not None and len(known) == len(comparisons) and loop != "knows":
-            deficit = 100 * (comparisons[:, 1] / known[:, 1] - 1)
+        if reference is not None and len(reference) == len(comparisons) and loop != "true":
+            deficit = 100 * (comparisons[:, 1] / reference[:, 1] - 1)
             deficit_panel.plot(comparisons[:, 0], deficit, mark, ms=3.5, color=colour, label=LABELS[loop])
-    if known is not None:
-        deficit = 100 * (at_same_times(known, t, rows["strehl"]) / known[:, 1] - 1)
+    if reference is not None:
+        deficit = 100 * (at_same_times(reference, t, rows["strehl"]) / reference[:, 1] - 1)
         deficit_panel.plot(
-            known[:, 0], deficit, "-", color=style.SERIES[0], lw=1.2, label="tracked, with pokes"
+            reference[:, 0], deficit, "-", color=style.SERIES[0], lw=1.2, label="tracked, with pokes"
         )
-    deficit_panel.axhline(-STREHL_LIMIT, color=style.MUTED, lw=1.0, ls=":", label="asked for")
+    deficit_panel.axhline(-STREHL_LIMIT, color=style.MUTED, lw=1.0, ls=":", label="limit")
     style.style_axes(panel).set_title("Strehl ratio, peak [%]", fontsize=9.5)
-    style.style_axes(deficit_panel).set_title("Strehl ratio beside the loop that knows [%]", fontsize=9.5)
+    style.style_axes(deficit_panel).set_title(
+        "Strehl ratio relative to the loop with the true registration [%]", fontsize=9.5
+    )
 
 
-#: Seconds of a look at the other loops, and how long they close before.
+#: Seconds of an interval of the other loops, and seconds for which they are closed before it.
 COMPARISON_S, CLOSING_S = 5.0, 1.0
-#: Modes and wavefronts that the true optical gain is found on; size of the poke in strokes.
+#: Modes and wavefronts of the push-pull that measures the true optical gain; size of the poke in strokes.
 GAIN_MODES, WAVEFRONTS, GAIN_POKE = 12, 4, 3e-3
 #: Seconds from one of those wavefronts to the next.
 WAVEFRONT_SPACING_S = 0.4
@@ -210,12 +216,12 @@ def drift_overrides(options: argparse.Namespace) -> list[str]:
 
 
 def open_bench(options: argparse.Namespace) -> System:
-    """The bench, drifting, with its streams of random numbers at their beginning."""
+    """Open the drifting bench, with its streams of random numbers at their beginning."""
     return open_system(options.system, set=drift_overrides(options), seed=options.seed)
 
 
-def load_or_make_start(options: argparse.Namespace) -> tuple[CalibrationResult, NDArray[np.float32]]:
-    """The calibration to start from and the model PSF, made on a bench that does not drift, once."""
+def load_or_measure_start(options: argparse.Namespace) -> tuple[CalibrationResult, NDArray[np.float32]]:
+    """Initial calibration and model PSF, measured once on a bench without drift."""
     matrix, image = options.out / "start.fits", options.out / "psf.npy"
     if not matrix.exists():
         with open_system(options.system, set=options.set, seed=options.seed) as bench:
@@ -228,10 +234,10 @@ def load_or_make_start(options: argparse.Namespace) -> tuple[CalibrationResult, 
 
 
 class WavefrontRms:
-    """Keeps the rms of the wavefront in front of the sensor, mirror included, of every moment it is seen."""
+    """Records the rms of every wavefront in front of the sensor, mirror included."""
 
     def __init__(self, twin: SimBench) -> None:
-        self._share = (twin.pupil.lit / np.count_nonzero(twin.pupil.lit)).astype(np.float32).ravel()
+        self._weights = (twin.pupil.lit / np.count_nonzero(twin.pupil.lit)).astype(np.float32).ravel()
         self.seconds, self.nm = array("d"), array("f")
         twin.path_callbacks.append(self)
 
@@ -239,11 +245,13 @@ class WavefrontRms:
         """Take the optical path ``(n, n)`` in metres."""
         self.seconds.append(time_s)
         path = opd.ravel()
-        self.nm.append(1e9 * math.sqrt(float((path * path) @ self._share) - float(path @ self._share) ** 2))
+        self.nm.append(
+            1e9 * math.sqrt(float((path * path) @ self._weights) - float(path @ self._weights) ** 2)
+        )
 
 
 class WavefrontSampler:
-    """Keeps a few wavefronts in front of the sensor from certain moments on, by time."""
+    """Records a few wavefronts in front of the sensor from each of several times on."""
 
     def __init__(self, twin: SimBench, starts: NDArray[np.float64]) -> None:
         self.samples: list[list[tuple[float, NDArray[np.float32]]]] = []
@@ -263,7 +271,7 @@ class WavefrontSampler:
 
 
 def matrix_at(bench: System, start: CalibrationResult, here: Registration) -> NDArray[np.float64]:
-    """The start's matrix moved to a registration ``(n_slopes, n_modes)``, each mode as strong as it was."""
+    """Initial matrix at another registration ``(n_slopes, n_modes)``, with the gain of every mode kept."""
     known, matrix, model = start.registration, start.matrix, bench.model(start.grid)
     assert known is not None
     then, now = (
@@ -277,13 +285,13 @@ def true_optical_gain(
 ) -> float:
     """Mean optical gain around wavefronts by push-pull, relative to the start's matrix.
 
-    The start's matrix is moved to the true registration of the moment first: what is wanted is how much
-    weaker the sensor answers, not where the mirror sits.
+    The initial matrix is first moved to the true registration, so that the ratio contains the sensor's gain
+    only and no misregistration.
     """
     m2c, slopes_of = result.matrix.m2c, build_slope_function(bench, result.grid)
     light = twin.wfs_light(bench.wfs.settings.exposure_s)
     unit = matrix_at(bench, result, twin.flexure.at(wavefronts[0][0]))
-    shares = []
+    gains = []
     for time_s, opd in wavefronts:
         for mode in np.linspace(0, m2c.shape[1] - 1, GAIN_MODES).astype(int):
             shape = twin.mirror_opd(GAIN_POKE * m2c[:, mode], time_s)
@@ -294,20 +302,20 @@ def true_optical_gain(
                 # The camera's own frame: its black level and noise decide what the threshold cuts.
                 frame, _ = twin.wfs_detector.expose(image, *light)
                 slopes.append(slopes_of(frame).astype(float).copy())
-            answer = (slopes[0] - slopes[1]) / (2 * GAIN_POKE)
-            shares.append(float(answer @ unit[:, mode]) / float(unit[:, mode] @ unit[:, mode]))
-    return float(np.mean(shares))
+            response = (slopes[0] - slopes[1]) / (2 * GAIN_POKE)
+            gains.append(float(response @ unit[:, mode]) / float(unit[:, mode] @ unit[:, mode]))
+    return float(np.mean(gains))
 
 
 def run_tracker(options: argparse.Namespace) -> None:
-    """Run the tracker and write what it said beside the truth."""
-    result, psf = load_or_make_start(options)
+    """Run the tracker and write its results with the true values."""
+    result, psf = load_or_measure_start(options)
     with open_bench(options) as bench:
         twin = get_simulated_bench(bench)
         origin = twin.now_s
         ripples = WavefrontRms(twin)
         frozen = WavefrontSampler(
-            twin, np.linspace(origin + 3, origin + options.seconds - 1, 2 * options.looks)
+            twin, np.linspace(origin + 3, origin + options.seconds - 1, 2 * options.comparisons)
         )
         (options.out / "live.jsonl").unlink(missing_ok=True)
         found = bench.run(
@@ -333,7 +341,7 @@ def run_tracker(options: argparse.Namespace) -> None:
 
 
 class ProgressLog:
-    """Writes what the tracker tells every second to a file, and now and then to the terminal."""
+    """Writes the tracker's estimates of every second to a file, and every 20th to the terminal."""
 
     def __init__(self, path: Path) -> None:
         self._path, self._last = path, 0
@@ -351,7 +359,7 @@ class ProgressLog:
 def measure_strehl(
     bench: System, result: CalibrationResult, psf: Any, at_s: float, matrix: Any
 ) -> tuple[float, float]:
-    """Strehl ratio of a loop closed for a few seconds at a moment of the twin's clock; 0 where it is lost."""
+    """Strehl ratio of a loop closed for a few seconds at a time of the twin's clock; 0 if it diverges."""
     prepare_sensor(bench)
     bench.dm.flatten()
     get_simulated_bench(bench).advance_to(at_s - CLOSING_S)
@@ -374,18 +382,18 @@ def measure_strehl(
 
 
 def compare(options: argparse.Namespace) -> None:
-    """Strehl ratios of a loop that knows or that never looks, now and then."""
+    """Strehl ratios of a loop with the true registration or with its first matrix, at intervals."""
     tracked = json.loads((options.out / "track.json").read_text())
-    result, psf = load_or_make_start(options)
+    result, psf = load_or_measure_start(options)
     gains = np.array(tracked["gains"])
     done = read_comparison(options.out, options.loop)
     with open_bench(options) as bench:
         twin = get_simulated_bench(bench)
-        for end in comparison_times(tracked, options.looks):
+        for end in comparison_times(tracked, options.comparisons):
             if any(abs(end - one[0]) < COMPARISON_S for one in done):
                 continue
             at, matrix = tracked["origin"] + end - COMPARISON_S, result.matrix
-            if options.loop == "knows":
+            if options.loop == "true":
                 gain = float(np.interp(end, *gains.T))
                 data = gain * matrix_at(bench, result, twin.flexure.at(at + COMPARISON_S / 2))
                 matrix = replace(matrix, data=data.astype(np.float32))
@@ -394,17 +402,17 @@ def compare(options: argparse.Namespace) -> None:
             print(options.loop, *(f"{value:.4f}" for value in one), flush=True)
 
 
-def comparison_times(tracked: dict[str, Any], looks: int) -> NDArray[np.float64]:
-    """When the looks at the other loops end: where the tracker's Strehl ratios do."""
+def comparison_times(tracked: dict[str, Any], comparisons: int) -> NDArray[np.float64]:
+    """Ends of the intervals of the other loops: those of the tracker's Strehl ratios."""
     rows = {name: np.array(tracked["rows"][name], float) for name in ("seconds", "strehl")}
-    # A ratio holds the science frames of the five updates before.
+    # A ratio uses the science frames of the five preceding updates.
     ends = rows["seconds"][np.isfinite(rows["strehl"])][1:]
-    # Two rows apart at least: a look takes longer than the time that it covers.
-    return np.asarray(ends[:: max(2, len(ends) // looks)])
+    # At least two rows apart: an interval includes the time to close the loop.
+    return np.asarray(ends[:: max(2, len(ends) // comparisons)])
 
 
 def main() -> None:
-    """Parse, and do one of the three."""
+    """Run ``track``, ``compare`` or ``draw``."""
     parser = study_parser(__doc__, "razor-shwfs")
     parser.add_argument("what", choices=["track", "compare", "draw"])
     parser.add_argument("--seconds", type=float, default=600.0)
@@ -415,9 +423,9 @@ def main() -> None:
     parser.add_argument("--seeing", type=float, default=0.2, help="swing of r0, fraction")
     parser.add_argument("--memory", type=float, default=10.0)
     parser.add_argument("--poke", type=float, default=None, help="as configured by default")
-    parser.add_argument("--frames", type=int, default=2000, help="frames of the calibration before")
-    parser.add_argument("--looks", type=int, default=24, help="how often the other loops are closed")
-    parser.add_argument("--loop", choices=["knows", "never"], default="knows", help="what compare closes")
+    parser.add_argument("--frames", type=int, default=2000, help="frames of the initial calibration")
+    parser.add_argument("--comparisons", type=int, default=24, help="intervals of each of the other loops")
+    parser.add_argument("--loop", choices=list(LABELS), default="true", help="loop of compare")
     parser.add_argument("--seed", type=int, default=5)
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
     parser.add_argument("--figure", type=Path, default=Path("tracking.png"))

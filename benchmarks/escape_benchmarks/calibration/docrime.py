@@ -58,7 +58,7 @@ _SEED = 5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SyntheticRun:
-    """A run with a known matrix: the pokes sent, the slopes read, the truth.
+    """A run with a known matrix: the pokes sent, the slopes read, the true matrix.
 
     ``slopes[i]`` answers to ``pokes[i - 1]``; arrays ``(n_frames, n)``.
     """
@@ -163,7 +163,7 @@ def estimate_streaming(data: SyntheticRun, correlations: bool = False) -> NDArra
 def pyrtc_docrime(data: SyntheticRun) -> Iterator[Callable[[], NDArray[np.floating]] | None]:
     """PyRTC's routine fed with the frames of a run, or ``None`` where it is not installed.
 
-    It is told the true delay, which it cannot find out. Its streams are replaced by the arrays, so
+    It is given the true delay, which it cannot estimate. Its streams are replaced by the arrays, so
     that only its estimator is timed.
     """
     loops, streams = import_pyrtc("loop"), import_pyrtc("streams")

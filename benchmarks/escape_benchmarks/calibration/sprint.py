@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from escape_hw.api.sensor import SensorGeometry
     from escape_hw.config.system import SystemConfig
 
-#: The paper's laboratory case, Table 1; and one whose scalings are equal, for who knows only one.
+#: The paper's laboratory case, Table 1; and one with equal scalings, for solvers with a single scaling.
 INJECTED = Registration(-16.0, -71.0, -0.77, 2.9, 0.0)
 INJECTED_EQUAL_SCALINGS = Registration(-16.0, -71.0, -0.77, 1.45, 1.45)
 #: Sub-apertures across the pupil in which those shifts are given.
@@ -46,14 +46,14 @@ INJECTED_N_SUB = 24
 MODES = (5, 40)
 #: White noise on the matrix, relative to the median column, and how often it is drawn.
 NOISE, N_DRAWS = 0.15, 4
-#: A mirror as it comes: scatter of the actuators' gains, and coupling where the model says 0.4.
+#: A mirror with realistic imperfections: scatter of the actuators' gains, and coupling (0.4 in the model).
 GAIN_SCATTER, COUPLING = 0.05, 0.43
-#: Far starts: shifts in actuator pitches, directions in degrees, and what else is injected.
+#: Large misregistrations: shifts in actuator pitches, directions in degrees, and the other parameters.
 PITCHES, DIRECTIONS = (0.25, 0.5, 1.0, 1.5, 2.0), (20.0, 200.0)
 OTHER_PARAMETERS = (1.0, 2.0, 0.0)
-#: What counts as found from afar, in the units of the parameters; there is no noise in these.
+#: Tolerance of a recovered large misregistration, in the units of the parameters; without noise.
 CAPTURE_TOLERANCE = np.array([5.0, 5.0, 0.1, 0.5, 0.5])
-#: Labels and solvers: gain and registration only, and with what the model does not know.
+#: Labels and solvers: gain and registration only, and with random effects.
 _REGISTRATION_ONLY: tuple[str, Solver] = ("registration only", "registration-only")
 _WITH_MISFIT: tuple[str, Solver] = ("with misfit", "mixed-effects")
 _SOLVERS = (_REGISTRATION_ONLY, _WITH_MISFIT)
@@ -128,7 +128,7 @@ class EscapeSolver:
     m2c: NDArray[np.float64]
 
     def solver(self, solver_name: Solver, noise: bool = True) -> Solve:
-        """The model built, and the solver on it, told of the noise or of none."""
+        """Build the model; return the solver on it, with or without noise."""
         grid = _sensor(self.config)
         model = make_fast_model(self.config, grid)
 
@@ -144,12 +144,12 @@ class EscapeSolver:
         return solve
 
     def matrix(self, registration: Registration) -> NDArray[np.float64]:
-        """What our model says is measured under a registration."""
+        """Matrix of our model at a registration."""
         return modal_matrix(make_fast_model(self.config, None), registration, self.m2c)
 
 
 def mirror(real: bool) -> MirrorUnderTest:
-    """The mirror as designed, or as it comes."""
+    """The nominal mirror, or one with realistic imperfections."""
     gains = GAIN_SCATTER * np.random.default_rng(7).standard_normal(97) if real else np.zeros(97)
     return MirrorUnderTest(1 + gains, COUPLING if real else 0.4)
 
@@ -255,10 +255,10 @@ def _accuracy(
 
 
 def _capture_rows(config: SystemConfig, oopao: OopaoPeer, what: str) -> list[BenchmarkRow]:
-    """How many far registrations are found, and how many wrong ones are vouched for."""
+    """Numbers of large misregistrations recovered, and of wrong results reported as converged."""
     solve = EscapeSolver(config, oopao.m2c).solver("registration-only", noise=False)
     pitch = 100 * config.sensor.n_sub / config.devices.dm.pitches_across_pupil
-    # The same share of the pupil on every sensor.
+    # The same fraction of the pupil on every sensor.
     tolerance = CAPTURE_TOLERANCE * ([config.sensor.n_sub / INJECTED_N_SUB] * 2 + [1] * 3)
     places = [
         Registration(
@@ -280,8 +280,18 @@ def _capture_rows(config: SystemConfig, oopao: OopaoPeer, what: str) -> list[Ben
     unit = f"of {len(places)}"
     ours, theirs = zip(found.tolist(), wrong.tolist(), strict=True)
     return [
-        BenchmarkRow(f"{what}: found from afar", ours[0], theirs[0], peer_label, unit, "higher", note),
-        BenchmarkRow(f"{what}: wrong but vouched for", ours[1], theirs[1], peer_label, unit, "lower", note),
+        BenchmarkRow(
+            f"{what}: recovered from large misregistrations",
+            ours[0],
+            theirs[0],
+            peer_label,
+            unit,
+            "higher",
+            note,
+        ),
+        BenchmarkRow(
+            f"{what}: wrong but reported as converged", ours[1], theirs[1], peer_label, unit, "lower", note
+        ),
     ]
 
 
@@ -290,7 +300,7 @@ def _specula_rows(config: SystemConfig, modes: NDArray[np.float64]) -> list[Benc
     solve, what = ours.solver("registration-only"), f"sprint, {modes.shape[1]} modes"
     our_data = _draws(ours.matrix(INJECTED_EQUAL_SCALINGS))
     peer = specula_peer(config, modes, make_fast_model(config, None))
-    label, note = "each its own sensor, registration only", "one scaling injected; SPECULA knows no more"
+    label, note = "each its own sensor, registration only", "one scaling injected; SPECULA has one scaling"
     if peer is None:
         seconds = time_alternately(lambda: solve(our_data[0]), None, rounds=2)[0]
         return [time_row(f"{what}: {label}", (seconds, None), "SPECULA", "s", MISSING)]

@@ -1,7 +1,7 @@
-"""What a second worker brings a sweep: loops per second with two against one, in turns.
+"""Gain of a second worker in a sweep: loops per second with two against one, in turns.
 
-Cores share caches, memory and, on a virtual machine, their host; so the same turns also tell what a second
-process brings arithmetic that shares nothing.
+Cores share caches, memory and, on a virtual machine, their host; so the same turns also show the gain of a
+second process for arithmetic that shares nothing.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ def _rate(submit: Callable[[Any], Future[Any]], work: Sequence[Any]) -> float:
 
 
 def _reference_work() -> float:
-    """Work of a processor that touches no memory worth the name."""
+    """Arithmetic with negligible memory access."""
     total = 0.0
     for number in range(REFERENCE_ITERATIONS):
         total += number * number

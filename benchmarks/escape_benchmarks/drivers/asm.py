@@ -74,7 +74,7 @@ def _emulator() -> Iterator[int]:
         first_line = process.stderr.readline() if process.stderr is not None else ""
         found = re.search(r":(\d+)\s*$", first_line)
         if found is None:
-            raise DeviceError("asm", f"the emulator did not start: {first_line.strip() or 'it said nothing'}")
+            raise DeviceError("asm", f"the emulator did not start: {first_line.strip() or 'no output'}")
         yield int(found[1])
     finally:
         process.kill()
@@ -82,7 +82,7 @@ def _emulator() -> Iterator[int]:
 
 
 class _BareSocketClient:
-    """A client that has every byte ready and looks at none that it gets."""
+    """A client that has every message ready and discards replies."""
 
     def __init__(self, port: int, n_act: int) -> None:
         self._codec, self._sequence = AsmCodec(), 0

@@ -46,7 +46,7 @@ def run() -> list[BenchmarkRow]:
 
 
 def _emulator(stack: ExitStack) -> tuple[str, int]:
-    """An emulated controller of its own, and where it listens."""
+    """An emulated controller of its own, and its address."""
     emulator = emulator_factory("e727")(EmulatorRequest(port=0, options={"zeroed": "1"}))
     host, _, port = emulator.start().removeprefix("tcp ").rpartition(":")
     stack.callback(emulator.stop)
@@ -54,7 +54,7 @@ def _emulator(stack: ExitStack) -> tuple[str, int]:
 
 
 def _exchange(wire: socket.socket, text: bytes) -> bytes:
-    """The least that anybody can do: send, and wait for the end of the reply."""
+    """Lower bound: send, and wait for the end of the reply."""
     wire.sendall(text)
     reply = b""
     while not reply.endswith(b"\n") or reply.endswith(b" \n"):
@@ -68,7 +68,7 @@ def _client(host: str, port: int) -> Any:
         return None
     pipython = importlib.import_module("pipython")
     wire = importlib.import_module("pipython.pidevice.interfaces.pisocket").PISocket(host, port)
-    # It disconnects by itself when it is forgotten, and trips over a second time.
+    # Its destructor disconnects; disconnecting a second time raises an error.
     return pipython.GCSDevice(gateway=wire)
 
 

@@ -88,7 +88,7 @@ def oopao_frame(config: SystemConfig) -> Callable[[], object]:
         with suppress_output():
             atmosphere.update()
             mirror.coefs = paths[next(counter) % _N_COMMANDS]
-            # '**' starts a new propagation; '*' goes on with it.
+            # '**' starts a new propagation; '*' continues it.
             source**atmosphere * telescope * mirror * sensor
             return sensor.signal
 
@@ -96,7 +96,7 @@ def oopao_frame(config: SystemConfig) -> Callable[[], object]:
 
 
 def _layer_options(config: SystemConfig, diameter: float) -> dict[str, Any]:
-    """OOPAO's words for the layers of the open-air turbulence, or for the screen on the bench."""
+    """OOPAO's parameters of the layers of the open-air turbulence, or for the screen on the bench."""
     open_air, screen = config.twin.atmosphere, config.devices.screen
     if open_air is not None:
         r0, outer, speeds = open_air.r0_m, open_air.outer_scale_m, list(open_air.speed_m_s)

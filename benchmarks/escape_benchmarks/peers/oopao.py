@@ -30,7 +30,7 @@ from escape_sim.optics.pupil import PupilGeometry, pupil_geometry
 if TYPE_CHECKING:
     from escape_hw.config.system import SystemConfig
 
-#: OOPAO thinks in telescopes and rounds shifts: the same bench a thousand times larger.
+#: OOPAO is made for telescopes and rounds shifts: the bench is modelled a thousand times larger.
 _SCALE = 1000.0
 #: OOPAO's numbers of the parameters, in the order of ``PARAMETERS``.
 _PARAMETERS = (0, 1, 2, 4, 5)
@@ -38,7 +38,7 @@ _PARAMETERS = (0, 1, 2, 4, 5)
 
 @dataclass(frozen=True, slots=True)
 class SolverResult:
-    """What a solver says: the registration, and whether it vouches for it."""
+    """Registration, and whether the solver reports it as valid."""
 
     registration: Registration
     valid: bool

@@ -38,7 +38,7 @@ def specula_peer(config: SystemConfig, m2c: NDArray[np.float64], model: Syntheti
 
 @contextmanager
 def _ignore_empty_subapertures() -> Iterator[None]:
-    """Sub-apertures without light make synim average nothing, which it may do in silence."""
+    """Sub-apertures without light make synim average nothing, whose warning is suppressed."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)
         yield
@@ -47,7 +47,7 @@ def _ignore_empty_subapertures() -> Iterator[None]:
 class SpeculaPeer:
     """SPECULA's ``SprintShSynim`` on matrices of synim.
 
-    Its estimation loop is called with a matrix in hand, without the simulation around it. It knows
+    Its estimation loop is called with a given matrix, without its simulation. It supports
     shifts, rotation and one magnification; its anamorphosis divides by zero at its own start. It gets
     the gain of 1, with which it needs fewest iterations, and a threshold that lets it finish.
 

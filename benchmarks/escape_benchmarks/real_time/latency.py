@@ -38,16 +38,16 @@ from escape_hw.streams.segments import segment_name
 
 #: Every rule of the guard is on.
 LIMITS = MirrorLimits(max_stroke=0.8, max_slew=1.0, max_mean=0.5, max_neighbour=0.9)
-#: Seconds about the time a frame is due in which nobody sleeps.
+#: Seconds of busy waiting before a frame is due.
 SPIN_S = 150e-6
-#: Frames before those that count.
+#: Frames before the evaluated ones.
 WARM_UP = 200
 FULL_SCALE_BITS = 16
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LatencyCase:
-    """What both codes run.
+    """Case that both packages run.
 
     Parameters
     ----------
@@ -80,14 +80,14 @@ class LatencyResult:
 
 
 class TimestampingMirror(DeformableMirror):
-    """A mirror that only books when commands come."""
+    """A mirror that only records the times of commands."""
 
     def __init__(self, n_act: int) -> None:
         super().__init__("dm", LIMITS)
         side = int(np.ceil(np.sqrt(n_act)))
         layout = (np.arange(side * side) < n_act).reshape(side, side)
         places = np.argwhere(layout)[:, ::-1].astype(np.float64)
-        self._info = DMInfo("booking mirror", "0", n_act, layout, places, 1e-6, True)
+        self._info = DMInfo("timestamping mirror", "0", n_act, layout, places, 1e-6, True)
         self.times = array("q")
 
     @property
@@ -129,7 +129,7 @@ def paced_camera(case: LatencyCase) -> Iterator[str]:
 
 
 def run_loop(case: LatencyCase, seconds: float, *, streams: bool = False) -> LatencyResult:
-    """Close the loop on the case's frames for a while; with ``streams`` all it does goes to rings, too."""
+    """Close the loop on the case's frames; with ``streams``, also write all data to rings."""
     rows, columns = case.frames.shape[1:]
     info = CameraInfo("paced camera", "0", (rows, columns), FULL_SCALE_BITS, True)
     settings = CameraSettings(Region(0, 0, columns, rows), 0.5 / case.rate_hz, case.rate_hz)
@@ -158,7 +158,7 @@ def run_loop(case: LatencyCase, seconds: float, *, streams: bool = False) -> Lat
 
 @contextmanager
 def _callbacks(case: LatencyCase, arrived: array[int], streams: bool) -> Iterator[Callbacks]:
-    """Taps that book when frames came and, if asked for, write frames, commands and residuals to rings."""
+    """Callbacks that record arrival times and, with ``streams``, write all data to rings."""
     if not streams:
         yield Callbacks(frame=lambda frame: arrived.append(frame.arrived_ns))
         return
@@ -187,7 +187,7 @@ def _grid(case: LatencyCase) -> SubApertureGrid:
     return SubApertureGrid(float(case.pitch), (half, half), valid, references, valid.astype(np.float32))
 
 
-#: Seconds in which its threads get going.
+#: Seconds for its threads to start.
 _WARM_UP_S = 2.0
 _STREAMS = ("wfs_raw", "wfs", "signal", "signal_2d", "wfc", "wfc_2d")
 
@@ -204,14 +204,14 @@ def run_peer(case: LatencyCase, seconds: float) -> LatencyResult | None:
         for part in parts:
             part.start()
         time.sleep(_WARM_UP_S)
-        look = streams.open_stream(names["wfc"], readonly=True)
-        before, began = look.count, time.perf_counter()
+        commands = streams.open_stream(names["wfc"], readonly=True)
+        before, began = commands.count, time.perf_counter()
         report, _ = latency.measure_stream_path_latency(
             [names["wfs"], names["signal"], names["wfc"]], samples=round(seconds * case.rate_hz),
             timeout_seconds=4 * seconds + 10,
         )  # fmt: skip
-        rate = (look.count - before) / (time.perf_counter() - began)
-        look.close()
+        rate = (commands.count - before) / (time.perf_counter() - began)
+        commands.close()
     except TimeoutError:
         return LatencyResult(np.array([]), 0.0, 0, ("the peer's own measurement timed out",))
     finally:

@@ -1,6 +1,6 @@
-"""A process that plays a camera: the frames of a file go round in a ring, at a rate.
+"""A process that emulates a camera: writes the frames of a file to a ring, cyclically, at a given rate.
 
-It ends when its standard input does.
+It ends when its standard input is closed.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from escape_hw.streams.realtime import PRIORITY, realtime_thread
 from escape_hw.streams.ring import RingWriter
 from escape_hw.streams.segments import segment_name
 
-#: Frames that the ring keeps, as the buffers of a camera's driver would.
+#: Frames that the ring holds, as the buffers of a camera's driver do.
 SLOTS = 64
 
 
@@ -24,7 +24,7 @@ def _segment_name() -> str:
 
 
 def main() -> None:
-    """Write frames until nobody wants any."""
+    """Write frames until stopped."""
     frames, rate = np.load(sys.argv[1], allow_pickle=False), float(sys.argv[2])
     ended = threading.Event()
 
@@ -33,13 +33,13 @@ def main() -> None:
         ended.set()
 
     threading.Thread(target=wait_for_stdin_end, daemon=True).start()
-    # A camera's clock waits for no process; what was not allowed, the loop's own attempt tells.
+    # Above the loop's priority, as a camera's clock is; a missing permission shows in the notes of the loop.
     with realtime_thread(priority=PRIORITY + 1), RingWriter(_segment_name(), frames[0].nbytes, SLOTS) as ring:
         print(ring.name, flush=True)
         index, due = 0, time.perf_counter()
         while not ended.is_set():
             now = time.perf_counter()
-            # After a long halt it goes on from there, as the peer's does.
+            # After a long halt it continues from the present time, as the peer's camera does.
             due = now if now - due > 0.1 else due
             if due > now:
                 time.sleep(due - now)

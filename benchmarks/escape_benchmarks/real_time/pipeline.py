@@ -19,7 +19,7 @@ from escape_hw.pipeline.slopes.shack_hartmann import ShackHartmannSlopes
 
 def run() -> list[BenchmarkRow]:
     """All rows of the stage."""
-    # RAZOR's grid with whole pixels (the peer knows no others), and a large one.
+    # RAZOR's grid with whole pixels (the peer supports no others), and a large one.
     rows = [_slopes(n_sub, pitch) for n_sub, pitch in ((10, 8), (24, 16), (40, 8))]
     rows += [_pyramid(n, mode) for n, mode in ((16, "global"), (64, "global"), (64, "local"))]
     return rows + [_integrator(modes, slopes) for modes, slopes in ((97, 200), (94, 900), (1200, 2512))]
