@@ -88,7 +88,7 @@ class EscapeCamera(WavefrontSensor):  # type: ignore[misc]  # pyRTC is not typed
             raise
 
     def expose(self) -> None:
-        """Publish the next frame; none, when none comes in time, which pyRTC's watchdog then sees."""
+        """Publish the next frame; none, when none comes in time, which pyRTC's watchdog then detects."""
         try:
             self.data = self.camera.next_frame(self._wait_s).data
         except FrameTimeout as late:

@@ -107,9 +107,9 @@ def plan_lines(plan: ProcedurePlan) -> list[str]:
 
 
 def progress_line(running: ActiveRun) -> str:
-    """How far a procedure is."""
+    """Progress of a procedure."""
     many = "s" if (running.total or running.completed) != 1 else ""
-    # What goes on until it is stopped has no total.
+    # A procedure that runs until it is stopped has no total.
     whole = f" of {running.total}" if running.total else ""
     line = f"{running.stage or running.name}: {running.completed}{whole} {running.unit}{many}"
     if running.paused:
@@ -120,7 +120,7 @@ def progress_line(running: ActiveRun) -> str:
 
 
 def metrics_line(metrics: Mapping[str, float]) -> str:
-    """Numbers worth watching."""
+    """Progress metrics."""
     known = {name: value for name, value in metrics.items() if math.isfinite(value)}
     return " · ".join(f"{name.replace('_', ' ')} {value:.4g}" for name, value in known.items())
 

@@ -1,4 +1,4 @@
-"""Form for the arguments of a procedure, built from its description by the server."""
+"""Form generated from the server's declaration of a procedure."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ class ArgumentForm(QWidget):
                 field.blockSignals(True)
                 field.clear()
                 field.addItems([form_text.NO_CHOICE, *matrices])
-                # A procedure that is about a matrix takes the newest unless told otherwise.
+                # A procedure about a matrix takes the newest one by default.
                 wanted = now if now in matrices and not first else self._default_matrix(one)
                 field.setCurrentText(wanted)
                 field.blockSignals(False)

@@ -66,7 +66,7 @@ def check_space(folder: Path, need_bytes: int) -> None:
 
 
 def check_writable(folder: Path, need_bytes: int = 0) -> None:
-    """Prove by writing that a folder takes files, before anything moves.
+    """Check by writing that a folder accepts files, before anything moves.
 
     Raises
     ------

@@ -44,7 +44,7 @@ PYRAMID_GOAL = np.array([4.0, 4.0, 0.05, 0.2, 0.2])
 FRAMES = (20, 50, 100, 220, 300, 500, 1000)
 #: From the paper's matrix, from the whitened matrix, and from the whitened frames.
 ESTIMATORS = ("unwhitened", "whitened", "telemetry")
-#: Seconds between two looks at an abort.
+#: Seconds between two checks for an abort.
 _POLL_S = 0.2
 
 

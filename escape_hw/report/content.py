@@ -30,7 +30,7 @@ class RunContent:
     """Everything a report shows; see :func:`read_run`.
 
     By label, as shown: ``calibrations``, ``loops``, ``gains``, and ``names``, the product each calibration
-    came from. By product: ``digests`` and ``kinds``, as their headers say.
+    came from. By product: ``digests`` and ``kinds``, from their headers.
     """
 
     folder: Path

@@ -145,8 +145,8 @@ def _gains_section(run: RunContent) -> str:
     for number, (label, result) in enumerate(run.gains.items()):
         if result.rounds:
             caption = (
-                f"Optical gain of every mode relative to the {label} matrix, with standard errors, and its "
-                "smooth course with its own."
+                f"Optical gain of every mode relative to the {label} matrix, with standard errors, and the "
+                "trend with its own."
             )
             parts.append(html.figure(f"og{number}", figures_gains.optical_gains(result), caption))
         caption = (
@@ -195,8 +195,8 @@ def _track_section(run: RunContent) -> str:
     drawing = figures_track.track_figure(track, exchanges, alarms, injected)
     caption = (
         "Live registration, optical gain and image quality, with standard errors. "
-        "Upright and dotted: a new matrix was taken into use. Upright and full: an alarm."
-        + ("" if injected is None else " Dotted course: injected value; no estimator reads it.")
+        "Vertical dotted lines: exchanges of the matrix. Vertical solid lines: alarms."
+        + ("" if injected is None else " Dotted time series: injected values, which no estimator reads.")
     )
     lines = tuple(
         (

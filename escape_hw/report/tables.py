@@ -1,4 +1,4 @@
-"""Results as tables of text, for the terminal and the report alike."""
+"""Results as tables of text, for the terminal and for the report."""
 
 from __future__ import annotations
 

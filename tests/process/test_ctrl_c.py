@@ -105,8 +105,8 @@ def test_ctrl_c_prints_the_command_to_resume(start, system, tmp_path):
     running.wait_for("DO-CRIME")
     running.let_work(0.5)
     ended = running.stop(signal.SIGINT)
-    (way,) = [line.strip() for line in ended.lines if "go on with: " in line]
-    words = shlex.split(way.removeprefix("go on with: "))
+    (way,) = [line.strip() for line in ended.lines if "resume with: " in line]
+    words = shlex.split(way.removeprefix("resume with: "))
     assert words == ["escape", "calibrate", "--resume", str(first)]
     taken = ended.document["frames"]
     ended = start(*words[1:], "--frames", taken + 1000, "--out", second).stop()
@@ -115,7 +115,7 @@ def test_ctrl_c_prints_the_command_to_resume(start, system, tmp_path):
     (told,) = [line for line in ended.lines if line.startswith("resuming ")]
     assert str(first) in told
     assert told.endswith(f"products go to {second}")
-    assert not any("go on with: " in line for line in ended.lines)
+    assert not any("resume with: " in line for line in ended.lines)
 
 
 def test_sigterm(start, system, tmp_path):

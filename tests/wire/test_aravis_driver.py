@@ -135,9 +135,7 @@ def test_settings_go_to_the_increments_and_are_read_back(arv) -> None:
 def test_what_is_wrong_at_opening(arv) -> None:
     with pytest.raises(DeviceError, match=r"no camera with serial number '17' \(found: SIMSCI\)"):
         make("aravis", 'devices.science.serial="17"').open()
-    with pytest.raises(
-        DeviceError, match="sensor_px says 800 x 600; correct sensor_px to what the camera is"
-    ):
+    with pytest.raises(DeviceError, match="sensor_px is 800 x 600; correct sensor_px to what the camera is"):
         make("aravis", "devices.science.sensor_px=[800,600]").open()
     with make("aravis"), pytest.raises(DeviceError, match="camera_new: busy: used by another process"):
         make("aravis").open()

@@ -246,7 +246,7 @@ def test_what_the_hardware_does_is_told_not_what_was_asked(xi) -> None:
 
 
 def test_the_wrong_downsampling_is_noticed(xi) -> None:
-    with pytest.raises(DeviceError, match=r"is read out as 1280 x 1024 pixels, but sensor_px says 640 x 512"):
+    with pytest.raises(DeviceError, match=r"is read out as 1280 x 1024 pixels, but sensor_px is 640 x 512"):
         make("ximea", "devices.wfs.options.downsampling=1").open()
     assert xi.calls[-1] == "xiCloseDevice"
 

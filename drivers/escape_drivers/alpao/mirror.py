@@ -107,11 +107,11 @@ class AlpaoMirror(DeformableMirror):
         return self._require_connected()[1]
 
     def play_patterns(self, patterns: ArrayLike, repeats: int = 1) -> None:
-        """Have the electronics send shapes by themselves, one after the other; returns at once.
+        """Start a sequence of shapes that the electronics send autonomously; returns at once.
 
-        With ``trigger_in`` each edge brings the next shape. Nothing is made legal here: a sequence that
+        With ``trigger_in`` each edge brings the next shape. Nothing is clipped here: a sequence that
         breaks a limit anywhere, from the present shape on and from its end to its beginning, is
-        refused whole.
+        refused as a whole.
 
         Parameters
         ----------

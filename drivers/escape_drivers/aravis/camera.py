@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-#: After block 65535 of GigE Vision comes 1; longer identifiers go on.
+#: Block identifiers of GigE Vision wrap from 65535 to 1; longer identifiers do not wrap.
 _BLOCK_ID_RANGE = (1, 65535)
 _SUCCESS = 0
 _STATUS_TEXT = {

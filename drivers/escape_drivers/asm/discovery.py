@@ -25,7 +25,7 @@ def _probe(where: str, host: str, port: int) -> DiscoveredDevice:
     try:
         return _make_entry(host, port, link.connect(), link.request(m.GetHealth(), m.HealthReport))
     finally:
-        link.disconnect("it was only looked at")
+        link.disconnect("status query only")
 
 
 def _make_entry(host: str, port: int, welcome: m.Welcome, health: m.HealthReport) -> DiscoveredDevice:

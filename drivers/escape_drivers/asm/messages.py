@@ -46,8 +46,8 @@ class Result(enum.IntEnum):
 class Hello:
     """First message of a connection.
 
-    ``token`` is that of a session to be resumed, 0 for a new one; ``name`` tells a second client who
-    has the mirror.
+    ``token`` is that of a session to be resumed, 0 for a new one; ``name`` names the
+    mirror's owner to a second client.
     """
 
     role: Role
@@ -67,7 +67,7 @@ class GetHealth:
 
 @dataclass(frozen=True, slots=True)
 class SetState:
-    """Start a step of the ladder; answered at once, the step ends later."""
+    """Start a step of the state sequence; answered at once, the step ends later."""
 
     state: ShellState
 

@@ -106,9 +106,9 @@ class AsmMirror(AdaptiveSecondary):
     """An adaptive secondary behind ESCAPE's own link, or behind another by another codec.
 
     Every command is acknowledged with measured positions before the next one leaves: nothing queues.
-    While nothing else is sent a thread gives signs of life, so that the mirror's watchdog knows that
-    somebody is there. A link that breaks is reported by the call that meets it and got back in the
-    background; nothing is sent again by itself, the mirror stays in the state it is in.
+    While nothing else is sent, a thread sends heartbeats for the mirror's watchdog. A broken link is
+    reported by the call that meets it and reconnected in the background; nothing is sent again
+    automatically, and the mirror keeps its state.
 
     Parameters
     ----------
@@ -206,7 +206,7 @@ class AsmMirror(AdaptiveSecondary):
     def _present_shape(self) -> NDArray[np.float64] | None:
         return self._initial_shape
 
-    # ------------------------------------------------------------------ signs of life
+    # ------------------------------------------------------------------ heartbeats
     def _send_heartbeat_if_due(self) -> None:
         """Send a heartbeat when nothing else was sent for a while; restore a lost link."""
         if self._link.is_up and time.monotonic() - self._link.last_reply_s < self._options.heartbeat_s:
@@ -297,7 +297,7 @@ class AsmMirror(AdaptiveSecondary):
             self._update_info(welcome)
             return _to_shell_health(link.request(m.GetHealth(), m.HealthReport))
         finally:
-            link.disconnect("it was only looked at")
+            link.disconnect("status query only")
             if self._emulator is not None:
                 self._emulator.stop()
 

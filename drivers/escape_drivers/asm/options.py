@@ -30,11 +30,11 @@ class AsmOptions(Section):
     connect_s, reply_s
         Longest wait for a connection and for an answer.
     heartbeat_s
-        Without a command for so long, the driver gives a sign of life.
+        Time without a command after which the driver sends a heartbeat.
     step_s
-        Longest duration of one step of the ladder.
+        Longest duration of one step of the state sequence.
     retry_s
-        Pause between attempts to get a lost connection back.
+        Pause between attempts to reconnect.
     max_skips
         Commands in a row that the mirror may skip before that is an error.
     """

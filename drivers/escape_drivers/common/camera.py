@@ -47,8 +47,8 @@ class FrameCounter:
 class CameraClock:
     """Puts a camera's own time stamps on this computer's monotonic clock.
 
-    Spacing comes from the camera, which knows when it exposed. The offset is that of the frame that came
-    through fastest since ``start``, so that no exposure time is later than the arrival.
+    The spacing is that of the camera's exposure times. The offset is that of the frame with the shortest
+    delay since ``start``, so that no exposure time is later than the arrival.
     """
 
     def __init__(self) -> None:
@@ -154,7 +154,7 @@ class BlockingCamera(Camera, Generic[C]):
         if found != stated:
             raise DeviceError(
                 self.name,
-                f"is read out as {found[0]} x {found[1]} pixels, but sensor_px says {stated[0]} x "
+                f"is read out as {found[0]} x {found[1]} pixels, but sensor_px is {stated[0]} x "
                 f"{stated[1]}; correct sensor_px {alternative}",
             )
 

@@ -107,7 +107,7 @@ class CircleGenerator:
 
     # ------------------------------------------------------------------ turning
     def turn(self, modulation: Modulation) -> None:
-        """Turn as :meth:`achievable` says, and correct until the circle is round.
+        """Turn as :meth:`achievable` returns, and correct until the circle is round.
 
         Raises
         ------

@@ -29,9 +29,9 @@ class CommandUnconfirmed(DeviceError):
 class GcsLink:
     """One controller at the other end of a wire.
 
-    A question whose answer is lost or invalid is repeated once, after both ends have been brought
-    together again: an identity question goes out, and everything up to its answer is thrown away. A
-    dead peer is noticed within three times ``timeout_s``; from then on every call raises ``DeviceLost``.
+    A query whose reply is lost or invalid is repeated once, after both ends have been synchronised
+    again: an identity query is sent, and everything up to its reply is discarded. An unresponsive
+    peer is detected within three times ``timeout_s``; from then on every call raises ``DeviceLost``.
     """
 
     def __init__(self, name: str, transport: Transport, timeout_s: float) -> None:

@@ -24,7 +24,7 @@ _RECEIVE_BYTES, _USB_READ_BYTES = 65536, 16384
 
 
 class TransportLost(Exception):
-    """The transport is lost; the message says what to check."""
+    """The transport is lost; the message names the checks."""
 
 
 class Transport(Protocol):
@@ -323,7 +323,7 @@ class UsbTransport:
         )
 
 
-#: Where an emulated controller listens, ``HOST:PORT``; goes before the configuration, for rehearsals.
+#: Address of an emulated controller, ``HOST:PORT``; overrides the configuration, for tests with an emulator.
 ADDRESS_VARIABLE = "ESCAPE_E727"
 
 

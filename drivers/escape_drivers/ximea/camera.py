@@ -53,7 +53,7 @@ class XimeaOptions(Section):
         Edge on that input that starts an exposure; ``"off"``: the camera keeps its own rate.
     trigger_margin
         Share of the frame that the exposure leaves free with a trigger: for readout, and for edges that
-        come a little faster than ``frame_rate_hz`` says. A camera that is not ready misses every other one.
+        come a little faster than ``frame_rate_hz``. A camera that is not ready misses every other one.
     exposure_output
         Whether output 1 is high while the camera exposes.
     zero_rot

@@ -203,7 +203,7 @@ def build_sensor_setup(
     Raises
     ------
     CalibrationError
-        No spots or pupil images where the design says there should be.
+        No spots or pupil images where the design has them.
     """
     background = _estimate_dark_level(mean_frame) if bench.dark is None else 0.0
     calibrated = _calibrate_frame(bench, mean_frame, background)
@@ -271,7 +271,7 @@ def find_sensor(
     ConfigError
         The number of frames is not at least 1.
     CalibrationError
-        No spots or pupil images where the design says there should be.
+        No spots or pupil images where the design has them.
     """
     validate_frame_count(frames)
     prepare_sensor(bench)
@@ -302,7 +302,7 @@ def ensure_sensor_ready(
     Raises
     ------
     CalibrationError
-        No spots or pupil images where the design says there should be.
+        No spots or pupil images where the design has them.
     """
     bench.dm.flatten()
     prepare_sensor(bench)

@@ -180,7 +180,7 @@ class StaticFocusEstimator:
         (several layers, or no turbulence).
         """
         blocks = np.array(self._blocks, dtype=np.float64).reshape(-1, len(self._weights))
-        # Values and rates are smoothed alike.
+        # Values and rates are smoothed equally.
         value = (blocks[:-2] + 2 * blocks[1:-1] + blocks[2:]) / 4
         rate = (blocks[2:, :_FOCUS_INDEX] - blocks[:-2, :_FOCUS_INDEX]) / 2
         known = np.isfinite(value).all(axis=1) & np.isfinite(rate).all(axis=1)

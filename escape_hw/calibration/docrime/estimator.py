@@ -277,7 +277,7 @@ class DocrimeEstimator:
         Raises
         ------
         TooFewFrames
-            Fewer complete frames than modes plus a margin; the message says how many are needed.
+            Fewer complete frames than modes plus a margin; the message states how many are needed.
         CalibrationError
             The sensor does not respond significantly, or the pokes do not span the modes.
         """

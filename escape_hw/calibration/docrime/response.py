@@ -209,8 +209,8 @@ def fit_response(data: AlignedTelemetry, whitener: NDArray[np.float64], lags: in
     All slopes respond with the same weights, so the weights are regressed on the predictions of a provisional
     matrix. Fitted to the same frames, the noise of that matrix would be taken for a response at neighbouring
     lags. The frames are therefore cut in half, and the matrix of one half predicts the other. Its noise then
-    scales all weights alike, and they are scaled to sum 1. In closed loop the pokes are the instruments of
-    the commands, for the matrix and for the weights.
+    scales all weights equally, and they are normalised to sum 1. In closed loop the pokes are the instruments
+    of the commands, for the matrix and for the weights.
 
     The errors of the result allow for correlations between slopes.
     """
@@ -372,7 +372,7 @@ def require_no_late_response(data: AlignedTelemetry, whitener: NDArray[np.float6
     Raises
     ------
     CalibrationError
-        The sensor responds after the last lag; the message says when.
+        The sensor responds after the last lag; the message states when.
     """
     parts = fit_halves(
         filter_telemetry(data.select_slopes(RESPONSE_SLOPES), whitener, lags + _EXTRA_LAGS), lags

@@ -74,7 +74,7 @@ def escape(
         Calibration whose matrix closes the loop during the measurement; open loop by default.
     until
         Target at which to stop before that number of frames. A short run has no measured matrix, so it
-        refuses a signal-to-noise ratio; it takes all its frames, and a note of the result says whether the
+        refuses a signal-to-noise ratio; it takes all its frames, and a note of the result states whether the
         accuracy was reached.
     checkpoint
         File for the state of the run, from which it can be resumed. A short run refuses it.

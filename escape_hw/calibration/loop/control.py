@@ -148,7 +148,7 @@ class LoopControl:
             A number is out of range, or the matrix has other modes or another geometry, for which the loop
             must be opened first.
         IncompatibleProduct, CalibrationError
-            As for :func:`build_integrator`. The loop goes on unchanged.
+            As for :func:`build_integrator`. The loop continues unchanged.
         """
         with self._lock:
             now = self._requested

@@ -89,7 +89,7 @@ def run_until_opened(
     """Close the loop and keep it closed until a request or a fault opens it.
 
     The mirror is flat in the end in any case. On real devices the loop's thread asks for real-time priority;
-    the log says what the operating system refused.
+    the log states what the operating system refused.
 
     Progress has no end: its ``total`` is 0. Metrics: ``residual_nm``, ``gain``, ``leak``, ``dropped_modes``,
     ``clipped`` (share of the actuators), ``lost``, ``timeouts``, ``latency_p50``, ``latency_p99``,
@@ -105,8 +105,9 @@ def run_until_opened(
     Returns
     -------
     LoopSummary
-        ``fault`` says why the loop was opened without a request: mirror at its limits, growing residual
-        (``server.diverging_factor``, ``server.diverging_s``), no frames, no light, or a rejected command.
+        ``fault`` is the reason if the loop was opened without a request: mirror at its limits, growing
+        residual (``server.diverging_factor``, ``server.diverging_s``), no frames, no light, or a rejected
+        command.
 
     Raises
     ------

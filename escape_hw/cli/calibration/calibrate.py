@@ -94,7 +94,7 @@ def _suggest_resume(context: CommandContext, error: BaseException, request: Cali
     resumable = next((folder for folder in folders if (folder / STATE_FILE).is_file()), None)
     if resumable is not None:
         words = ["escape", "calibrate", "--resume", str(resumable), *(["--force"] if request.force else [])]
-        error.add_note(f"go on with: {shlex.join(words)}")
+        error.add_note(f"resume with: {shlex.join(words)}")
 
 
 def _with_modes(

@@ -1,4 +1,4 @@
-"""The state of a calibration that is still running, so that another process can go on with it."""
+"""State of an incomplete calibration, from which another process can resume it."""
 
 from __future__ import annotations
 

@@ -12,7 +12,7 @@ _INDEX_NAMES = {"yaml": "PyYAML", "pyrtc": "pyrtcao"}
 
 
 def import_optional(name: str, purpose: str) -> Any:
-    """Import an optional package; ``purpose`` begins the sentence that says what it is needed for.
+    """Import an optional package; ``purpose`` begins the message on what it is needed for.
 
     Raises
     ------

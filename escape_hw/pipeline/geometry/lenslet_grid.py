@@ -66,14 +66,14 @@ def _check_lattice(light: NDArray[np.float64], pitch: float, nominal: float) -> 
         )
     if abs(pitch / nominal - 1) > _PITCH_RANGE:
         raise CalibrationError(
-            f"the fitted lenslet pitch is {pitch:.3f} pixels, the design says {nominal}; "
+            f"the fitted lenslet pitch is {pitch:.3f} pixels, that of the design {nominal}; "
             "check sensor.pitch_px and the binning"
         )
     # Spots two or three pitches apart have contrast at a harmonic.
     wider = max(_contrast(light, m * pitch) for m in (2, 3))
     if contrast < _CONTRAST or wider > contrast / 2:
         raise CalibrationError(
-            f"the spots on the wavefront sensor are not {nominal} pixels apart, as the design says; "
+            f"the spots on the wavefront sensor are not {nominal} pixels apart, as in the design; "
             "check sensor.pitch_px and the binning, and that the light comes through the lenslets"
         )
 

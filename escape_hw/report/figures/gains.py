@@ -13,7 +13,7 @@ from escape_hw.report.tables import METHOD_LABELS
 
 
 def optical_gains(result: GainsResult) -> Figure:
-    """Gain of every mode with its error and the smooth course (paper: optical gain vectors).
+    """Gain of every mode with its standard error, and the trend (paper: optical gain vectors).
 
     Matrices whose gains lie below 1 (measured on a calmer beam than the loop's) are read on the left,
     those above 1 (measured in open loop) on the right, as in the paper.

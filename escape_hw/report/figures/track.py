@@ -1,4 +1,4 @@
-"""The course of a tracked run."""
+"""Time series of a tracked run."""
 
 from __future__ import annotations
 

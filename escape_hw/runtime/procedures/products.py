@@ -45,7 +45,7 @@ def add_result(
         The file cannot be written.
     """
     path, origin = folder.file(f"{name}.fits"), record.origin({one.name: file_sha256(one) for one in parents})
-    # A partial result is saved under a name that says so.
+    # The name of the file of a partial result states it.
     if isinstance(result, CalibrationResult):
         saved = save_matrix(path, result, origin)
     else:

@@ -218,7 +218,7 @@ class System(Bench):
         Raises
         ------
         CalibrationError
-            The loop cannot be closed, or diverges; the message says why.
+            The loop cannot be closed, or diverges; the message gives the reason.
         """
         from escape_hw.calibration.optical_gain.bootstrap import bootstrap_gains
         from escape_hw.calibration.sprint.synthetic_matrix import static_light_matrix

@@ -20,7 +20,7 @@ STAGES = (EXPLORE, SHORTLIST, FINAL)
 METRICS = ("peak", "otf", "encircled")
 #: Spacing of the stages' seeds.
 _SEED_SPACING = 1_000_000
-#: Names of version 0.1.0 in stored studies and sweep.json, and today's.
+#: Names of version 0.1.0 in stored studies and sweep.json, and the present ones.
 _RENAMED_KEYS = {
     "arm": "variant", "arms": "variants", "heats": "replicates", "finals": "final_replicates"
 }  # fmt: skip

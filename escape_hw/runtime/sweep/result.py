@@ -149,8 +149,8 @@ def _pairs(variants: Sequence[MatrixVariant]) -> Iterable[tuple[str, str]]:
         for other in others:
             if one.matrix == other.matrix and one.optical_gains and not other.optical_gains:
                 yield one.label, other.label
-    alike = [one.label for one in others if one.optical_gains == first.optical_gains]
-    yield from zip(alike[1:], alike, strict=False)
+    equal = [one.label for one in others if one.optical_gains == first.optical_gains]
+    yield from zip(equal[1:], equal, strict=False)
 
 
 def _comparisons(sweep: Sweep, records: Iterable[TrialRecord], margin: float) -> Iterable[VariantComparison]:

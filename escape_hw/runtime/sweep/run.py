@@ -22,7 +22,7 @@ from escape_hw.runtime.sweep.workers import Workers
 
 #: A loop is judged by the mean over its nearest neighbours: at most so many, and so large a share of all.
 _MAX_NEIGHBOURS, _MAX_NEIGHBOUR_FRACTION = 10, 0.05
-#: Seconds between two looks at an abort, and at the study when no loop ends.
+#: Seconds between two checks for an abort, and of the study when no loop ends.
 _POLL_S, _REFRESH_S = 0.2, 2.0
 #: Most threads that wait for workers.
 _MAX_THREADS = 1024

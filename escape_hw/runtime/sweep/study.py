@@ -64,7 +64,7 @@ class _SlotTaken(Exception):
 
 
 class _Storage(optuna.storages.RDBStorage):
-    """Storage whose heartbeats go on after it did not answer for a while."""
+    """Storage whose heartbeats continue after it did not answer for a while."""
 
     def record_heartbeat(self, trial_id: int) -> None:
         with contextlib.suppress(StorageInternalError, DBAPIError):
@@ -86,7 +86,7 @@ def _retried(
 class SweepStudy:
     """The trials of one sweep, one for each :class:`~escape_hw.runtime.sweep.design.Slot`.
 
-    Several runners on several machines may share one. Optuna hands each enqueued trial to one of them,
+    Several runners on several machines may share one. Optuna assigns each enqueued trial to one of them,
     records heartbeats while :meth:`run_next` runs it, and fails it when they stop, after which it is
     enqueued again with a new number: loops are identified by the slot in their user attributes. Every call
     waits up to ``timeout_s`` for a storage that does not answer. Loops have heartbeats in simulation; on

@@ -28,7 +28,7 @@ SINGLE_THREAD_VARIABLES = {
 SCHEDULER_TIMEOUT_S = 120.0
 #: How often one call may lose its worker.
 _MAX_DEATHS = 4
-#: Seconds between two looks at the connection to a scheduler.
+#: Seconds between two checks of the connection to a scheduler.
 _POLL_S = 1.0
 
 

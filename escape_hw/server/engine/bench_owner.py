@@ -62,7 +62,7 @@ class BenchOwner:
             self._flat_replies.append(reply)
         self.post(self.flatten)
 
-    def request_safe_state(self, reason: str, remedy: str = "Look at the log, then clear the fault.") -> None:
+    def request_safe_state(self, reason: str, remedy: str = "Read the log, then clear the fault.") -> None:
         """Latch a fault, stop what runs, and make the mirror safe."""
         log.error("FAULT: %s", reason)
         self.state.latch_fault(reason, remedy)
@@ -156,7 +156,7 @@ class BenchOwner:
                 self.bench.dm.flatten()
             except DeviceError as error:
                 self.make_safe(
-                    str(error), "The mirror cannot be flattened from here. If in doubt, switch its power off."
+                    str(error), "The mirror cannot be flattened from here. Switch its power off if needed."
                 )
         self.send_flat_replies()
 

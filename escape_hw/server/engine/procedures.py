@@ -105,7 +105,7 @@ def needs_loop(name: str, arguments: Arguments) -> bool:
 
 #: Standard deviations of the sum of random pokes that some actuator reaches in a run.
 _PEAK_SIGMAS = 4.0
-#: Share of the frames whose pokes the limits may shorten before the plan says so.
+#: Fraction of the frames whose pokes are clipped by the limits, above which the plan warns.
 _CLIPPED_WARNING_SHARE = 0.05
 
 

@@ -88,7 +88,7 @@ class StatePublisher:
             with self._emit_lock:
                 self._emit(self.state())
         except Exception:
-            # A value that is not available must not look like a dead engine.
+            # A value that is not available must not be taken for a failed engine.
             log.exception("the state could not be published")
 
     def state(self) -> State:

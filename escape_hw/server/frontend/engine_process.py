@@ -68,7 +68,7 @@ class EngineProcess:
     def maintain_failsafe(self, alive: bool) -> None:
         """Restart the fail-safe process after it died; call this every second.
 
-        The delay between restarts grows while the process dies at once or cannot be started. ``alive`` is
+        The delay between restarts grows while the process ends immediately or cannot be started. ``alive`` is
         whether it ran when the engine was last seen running.
         """
         if alive:

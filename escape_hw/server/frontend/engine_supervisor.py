@@ -49,7 +49,7 @@ IDLE_SILENCE_LIMIT_S = 120.0
 _SAFETY_TIMEOUT_S = 5.0
 #: Seconds between two heartbeats to the engine.
 _HEARTBEAT_S = 1.0
-_RESTART_REMEDY = "Look at the log, then clear the fault to start the engine again."
+_RESTART_REMEDY = "Read the log, then clear the fault to start the engine again."
 
 
 class EngineSupervisor:

@@ -75,7 +75,7 @@ class RecorderProcess:
 
 
 def main() -> None:
-    """Record what the command line says until standard input ends."""
+    """Record what the command line specifies until standard input ends."""
     os.nice(_NICE)
     request = json.loads(sys.argv[1])
     stop = watch_standard_input()

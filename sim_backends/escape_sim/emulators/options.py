@@ -15,7 +15,7 @@ F = TypeVar("F")
 
 
 def current_word(word: str, renamed: Mapping[str, str]) -> str:
-    """Replace a word of version 0.1.0 by the present one and say so on standard error."""
+    """Replace a word of version 0.1.0 by the present one with a warning on standard error."""
     if word not in renamed:
         return word
     print(f"deprecated: {word!r} is now {renamed[word]!r}; the old word will be removed", file=sys.stderr)

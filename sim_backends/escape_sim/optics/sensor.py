@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 def make_sensor_optics(config: SystemConfig, pupil: PupilGeometry) -> SensorOptics:
-    """Build the true optics of the twin's sensor, which differ from the design as ``twin`` says.
+    """Build the true optics of the twin's sensor, which differ from the design as configured in ``[twin]``.
 
     A pyramid is without modulation, with its images at their true positions.
     """

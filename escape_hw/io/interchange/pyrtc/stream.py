@@ -104,7 +104,7 @@ class ShmemStream:
         self._handle.close()
 
     def unlink(self) -> None:
-        """Remove the stream for everybody."""
+        """Remove the stream for all processes."""
         import_optional("pyshmem", "Removing pyRTC's streams").unlink_quiet(self.name)
 
 

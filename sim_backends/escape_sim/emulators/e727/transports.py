@@ -90,7 +90,7 @@ class ClientSession:
         self.final_condition = ""
 
     def feed(self, data: bytes) -> bytes:
-        """Process received bytes; returns the bytes to send. Raises ConnectionCut if a fault says so."""
+        """Process received bytes; returns the bytes to send. Raises ConnectionCut if a fault requires it."""
         outgoing = b""
         for line in self._controller.receive(data):
             kind = self._faults.next_fault()
@@ -221,7 +221,7 @@ class PtyServer(E727Server):
         """Open the terminal; returns ``pty /dev/pts/N``."""
         ours, theirs = os.openpty()
         tty.setraw(theirs)
-        # The other end is kept open here, too: reading fails when nobody has opened it.
+        # The other end is kept open here, too: reading fails when no process has opened it.
         self._descriptors = (ours, theirs)
         self._start_thread(lambda: self._serve(ours))
         return f"pty {os.ttyname(theirs)}"
