@@ -49,7 +49,7 @@ def parameter_hint(parameter: ProcedureParameter) -> str:
 
 
 def format_value(value: object) -> str:
-    """A value as it stands in the form."""
+    """A value as shown in the form."""
     if value is None:
         return ""
     return f"{value:g}" if isinstance(value, float) else str(value)

@@ -191,7 +191,7 @@ def reproduce_maps(
 
     The paper shows a matrix of 100 modes beside a simulated one and does not attempt a pseudo-synthetic
     matrix, because part of the mirror is contaminated and part of the pupil poorly illuminated. Here that
-    matrix is computed and judged by its loop.
+    matrix is computed and evaluated by its loop.
 
     Parameters
     ----------

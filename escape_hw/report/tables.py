@@ -78,8 +78,8 @@ def registration_table(
     estimates
         By column heading, such as ``SHORT``; an empty heading means alpha alone.
     injected
-        The truth hidden in a twin, shown in a last column; beside each estimate then stands its
-        difference from the truth over its standard error.
+        True values of a twin, shown in the last column; a column after each estimate then gives its
+        error in standard errors.
     """
     return parameters_table({k: {**one.parameters(), **one.extras} for k, one in estimates.items()}, injected)
 

@@ -89,7 +89,7 @@ def draw_psfs(
     """Draw the PSFs into a figure or a part of one; runs without an image are left out.
 
     All images are scaled to the model's flux. Logarithmic stretch relative to the model's maximum,
-    backgrounds subtracted; the three Strehl ratios stand below each in the paper's order: peak, optical
+    backgrounds subtracted; the three Strehl ratios are below each in the paper's order: peak, optical
     transfer function, encircled energy. Axes are in lambda/D where ``psf_px`` gives it in pixels, else in
     pixels.
     """

@@ -98,7 +98,7 @@ class TrackProcedure(MatrixProcedure["TrackResult"]):
             injected_course=None
             if injected is None
             else injected.trajectory(began, track["track"]["seconds"]),
-            # The truth where the track ends, beside its registration there.
+            # True values at the end of the track, for comparison with its last registration.
             injected_end=None if injected is None or not end else injected.at(began + end[0]).to_dict(),
             injected_note=INJECTED_UNKNOWN if record.simulated and injected is None else "",
             im=self.product.path.absolute(),

@@ -43,7 +43,7 @@ class BenchRecord:
         devices = {"dm": bench.dm, "wfs": bench.wfs, "modulator": bench.modulator, "science": bench.science}
         simulated = bool(bench.simulated)
         science = config.devices.science
-        # A registration that moves is not one that a single number could be held against.
+        # A drifting registration has no single true value.
         is_static = simulated and not config.twin.drift.is_drifting
         return cls(
             system=config.system.name,
@@ -85,13 +85,13 @@ def config_provenance(config: SystemConfig) -> Provenance:
 
 
 def actuator_layout(bench: Bench) -> tuple[str, ...]:
-    """Map of the actuators as rows of 0 and 1; empty when they do not stand on a grid."""
+    """Map of the actuators as rows of 0 and 1; empty if they are not on a grid."""
     layout = bench.dm.info.layout
     return () if layout is None else tuple("".join("1" if spot else "0" for spot in row) for row in layout)
 
 
 def actuator_positions(bench: Bench) -> tuple[tuple[float, float], ...]:
-    """Where actuators without a grid stand, (x, y) in metres; empty when they have one."""
+    """Positions (x, y) of actuators without a grid in metres; empty if they have one."""
     info = bench.dm.info
     return () if info.layout is not None else tuple((float(x), float(y)) for x, y in info.positions_m)
 

@@ -20,7 +20,7 @@ from escape_hw.runtime.sweep.study import SweepStudy, TrialRecord
 from escape_hw.runtime.sweep.trials import TrialSpec, run_closed_loop, run_trial
 from escape_hw.runtime.sweep.workers import Workers
 
-#: A loop is judged by the mean over its nearest neighbours: at most so many, and so large a share of all.
+#: Most nearest neighbours over which the merit of a loop is averaged: number, and fraction of all loops.
 _MAX_NEIGHBOURS, _MAX_NEIGHBOUR_FRACTION = 10, 0.05
 #: Seconds between two checks for an abort, and of the study when no loop ends.
 _POLL_S, _REFRESH_S = 0.2, 2.0
@@ -136,8 +136,8 @@ def _run_on_bench(
 ) -> Procedure[None]:
     """Run a stage on the open bench, one loop after the other.
 
-    A procedure yields its progress and can be aborted, which :meth:`optuna.Study.optimize` cannot: the
-    trials are asked for and told.
+    A procedure yields its progress and can be aborted, which :meth:`optuna.Study.optimize` cannot: this
+    function uses :meth:`SweepStudy.ask` and :meth:`SweepStudy.tell`.
     """
     while True:
         n_unfinished, n_waiting = study.enqueue_missing(plan, values, 1)
