@@ -13,23 +13,19 @@ from escape_gui.views.gain_curves import GainCurve
 from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.errors import EscapeError
 from escape_hw.remote.state import ProductEntry
+from escape_hw.report.tables import METHOD_LABELS
 
 if TYPE_CHECKING:
     from escape_hw.report.content import RunContent
 
 log = logging.getLogger(__name__)
 
-#: Order of methods in lists: measured with a calibration source, measured without one, computed.
-_METHOD_ORDER = (
-    "push-pull", "push-pull-fast", "modulated", "docrime", "docrime-whitened", "docrime-closed", "escape",
-)  # fmt: skip
-
 
 @dataclass(frozen=True, slots=True)
 class LoadedProducts:
     """Products read so far; replaced by a new object at every change."""
 
-    #: By label; matrices in the order of ``_METHOD_ORDER``.
+    #: By label; matrices in the order of ``METHOD_LABELS``.
     matrices: dict[str, InteractionMatrix] = field(default_factory=dict)
     gains: dict[str, GainCurve] = field(default_factory=dict)
 
@@ -100,7 +96,7 @@ def _collect(ready: dict[tuple[str, str, int], Future[RunContent | None]]) -> Lo
                 continue
             gains[label] = GainCurve.of(label, result.gains, [one.gains.best for one in result.rounds])
             gains |= {other: GainCurve.of(other, one) for other, one in result.comparisons.items()}
-    rank = {method: k for k, method in enumerate(_METHOD_ORDER)}
+    rank = {method: k for k, method in enumerate(METHOD_LABELS)}
     ordered = dict(sorted(matrices.items(), key=lambda item: rank.get(item[1].method, len(rank))))
     return LoadedProducts(ordered, gains)
 

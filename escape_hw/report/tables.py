@@ -12,15 +12,16 @@ from escape_hw.api.optical_gains import GainsResult
 from escape_hw.api.registration import Registration
 from escape_hw.api.results import Estimate, LoopResult, RegistrationEstimate
 
-#: How methods are called in figures and tables.
+#: Labels of methods in figures, tables and lists, in the order of lists: matrices measured with a calibration
+#: source, measured without one, computed.
 METHOD_LABELS = {
     "push-pull": "push-pull",
+    "push-pull-fast": "fast push-pull",
+    "push-pull-fast-closed": "fast push-pull, closed loop",
     "modulated": "modulation",
     "docrime": "DO-CRIME",
     "docrime-whitened": "DO-CRIME",
     "docrime-closed": "DO-CRIME, closed loop",
-    "push-pull-fast": "fast push-pull",
-    "push-pull-fast-closed": "fast push-pull, closed loop",
     "escape": "ESCAPE",
     "simulated": "simulation",
 }

@@ -27,6 +27,7 @@ from escape_hw.config.loader import load_system
 from escape_hw.deprecation import RenamedWarning
 from escape_hw.errors import ConfigError
 from escape_hw.remote.client import Connection
+from escape_hw.report.tables import METHOD_LABELS
 from escape_hw.runtime.procedures.calibration import CALIBRATIONS, DocrimeProcedure, EscapeProcedure
 from escape_hw.runtime.procedures.declaration import Parameter, ProcedureSpec, check_arguments, parameter
 from escape_hw.runtime.procedures.gains import GainsProcedure
@@ -101,6 +102,10 @@ def test_python_methods_have_the_declared_names_defaults_and_help(
         if name not in PYTHON_ONLY:
             assert one.default == declared[name].default, name
             assert declared[name].help.removesuffix(".") in doc
+
+
+def test_every_calibration_has_a_label() -> None:
+    assert CALIBRATIONS.keys() <= METHOD_LABELS.keys()
 
 
 def test_the_client_has_the_parameters_of_all_calibrations() -> None:
