@@ -1,4 +1,7 @@
-"""Live mode maps of the interaction matrix, and one mode in all matrices."""
+"""Live mode maps of the interaction matrix, and one mode in all matrices.
+
+The live matrix comes from the streams of a measurement, the others from ``client.product_library``.
+"""
 
 from __future__ import annotations
 

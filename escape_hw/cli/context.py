@@ -240,7 +240,7 @@ class CommandContext:
         Aborted
             The result is partial; it was saved and printed.
         """
-        from escape_hw.cli.calibration.display import show_result
+        from escape_hw.cli.calibration.display import format_result
 
         selection = selection.with_overrides(*procedure.overrides)
         config = self.load_config(selection)
@@ -252,7 +252,7 @@ class CommandContext:
                 result = self.run(procedure.compute())
                 saved = procedure.save_computed(folder, result, self.wall_seconds)
                 self.result(saved.document, met=saved.met)
-                show_result(self, procedure.name, result, saved.document["simulated"], saved.document)
+                self.show(*format_result(procedure.name, result, saved.document["simulated"], saved.document))
                 return
             with self.bench(selection) as bench:
                 from escape_hw.runtime.session.record import BenchRecord
@@ -262,7 +262,7 @@ class CommandContext:
             with self.protect_saving(stop):
                 saved = procedure.save(folder, record, result, self.wall_seconds)
                 self.result(saved.document, met=saved.met)
-                show_result(self, procedure.name, result, record.simulated, saved.document)
+                self.show(*format_result(procedure.name, result, record.simulated, saved.document))
             if stop is not None:
                 raise stop
             procedure.finish()

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import io
-from types import SimpleNamespace
 
 import pytest
 from rich.console import Console
 
 from escape_hw.api.registration import PARAMETERS, Registration
 from escape_hw.api.tracking import TrackResult
-from escape_hw.cli.calibration.display import show_result
+from escape_hw.cli.calibration.display import format_result
 from escape_hw.config.loader import load_system
 from escape_hw.io.documents import track_document
 from escape_hw.runtime.procedures.track import INJECTED_UNKNOWN, injected_registration
@@ -27,8 +26,8 @@ INJECTED = {
 def shown(result: TrackResult, injected: dict[str, float] | None, note: str = "") -> str:
     console = Console(file=io.StringIO(), width=120)
     document = {**track_document(result), "injected_end": injected, "injected_note": note, "products": {}}
-    one = SimpleNamespace(show=lambda *what: [console.print(item) for item in what])
-    show_result(one, "track", result, injected is not None, document)  # type: ignore[arg-type]
+    for item in format_result("track", result, injected is not None, document):
+        console.print(item)
     return console.file.getvalue()  # type: ignore[attr-defined, no-any-return]
 
 

@@ -18,8 +18,8 @@ from escape_hw.api.emulator import EmulatorRequest
 from escape_hw.config.registry import emulator_factory
 from escape_hw.errors import ConfigError
 from escape_sim.emulators.asm import protocol as w
-from escape_sim.emulators.asm.connection import AsmConnection
 from escape_sim.emulators.asm.emulator import AsmEmulator
+from escape_sim.emulators.asm.server import AsmConnection
 
 
 def refusal(payload: bytes) -> tuple[int, str]:

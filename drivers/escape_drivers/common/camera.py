@@ -70,14 +70,14 @@ log = logging.getLogger(__name__)
 MAX_WAIT_MS = 50
 
 
-class Connection(Protocol):
+class CameraConnection(Protocol):
     """A vendor's library with one camera, or a stream."""
 
     def close(self) -> None:
         """Disconnect."""
 
 
-C = TypeVar("C", bound=Connection)
+C = TypeVar("C", bound=CameraConnection)
 
 
 class BlockingCamera(Camera, Generic[C]):

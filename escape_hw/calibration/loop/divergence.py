@@ -1,4 +1,8 @@
-"""Rules that detect a diverging loop, and their limits."""
+"""Rules that detect a diverging loop, and their limits.
+
+``runner`` checks the mirror's limits in every loop, ``operation`` the residual of a loop that runs until it
+is opened, ``tracking.tracker`` the residual of a tracked one.
+"""
 
 from __future__ import annotations
 

@@ -13,22 +13,22 @@ if TYPE_CHECKING:
     from escape_hw.api.results import CalibrationResult, LoopResult
     from escape_hw.api.tracking import TrackResult
     from escape_hw.calibration.optical_gain.bootstrap import GainsRun
-    from escape_hw.cli.context import CommandContext
 
 
-def show_result(
-    context: CommandContext, procedure: str, result: object, simulated: bool, document: dict[str, Any]
-) -> None:
-    """Print the result of a procedure: its origin, its values, criteria and products.
+def format_result(
+    procedure: str, result: object, simulated: bool, document: dict[str, Any]
+) -> Iterator[RenderableType]:
+    """Format the result of a procedure: its origin, its values, criteria and products.
 
-    A procedure without a table of its own prints criteria and products only.
+    A procedure without a table of its own has criteria and products only.
     """
     from escape_hw.cli.formatting import format_criteria, format_products, status_line
 
-    context.show(status_line(simulated, bool(document.get("partial"))))
+    yield status_line(simulated, bool(document.get("partial")))
     if procedure in _VALUES:
-        context.show(*_VALUES[procedure](result, document))
-    context.show(*format_criteria(document.get("criteria", ())), *format_products(document["products"]))
+        yield from _VALUES[procedure](result, document)
+    yield from format_criteria(document.get("criteria", ()))
+    yield from format_products(document["products"])
 
 
 def _calibration(result: CalibrationResult, document: dict[str, Any]) -> Iterator[RenderableType]:

@@ -1,4 +1,4 @@
-"""Answers requests that the front end forwards, or forwards them to the main thread."""
+"""Answers requests that the front end has checked and forwarded, or forwards them to the main thread."""
 
 from __future__ import annotations
 

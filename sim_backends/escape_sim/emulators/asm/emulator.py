@@ -13,9 +13,8 @@ from escape_hw.api.emulator import Emulator, EmulatorRequest
 from escape_hw.config.loader import load_system
 from escape_hw.errors import ConfigError
 from escape_sim.devices.twins import shared_bench
-from escape_sim.emulators.asm.connection import AsmFault
 from escape_sim.emulators.asm.controller import AsmController, AsmLimits
-from escape_sim.emulators.asm.server import AsmServer
+from escape_sim.emulators.asm.server import AsmFault, AsmServer
 from escape_sim.emulators.options import EmulatorOptions, parse_fault_script
 from escape_sim.mirror.shell import MovingActuators, RealTimeActuators, Shell
 
@@ -35,7 +34,7 @@ def make_emulator(request: EmulatorRequest) -> AsmEmulator:
     return AsmEmulator(request)
 
 
-class AsmOptions(EmulatorOptions):
+class AsmEmulatorOptions(EmulatorOptions):
     """Options of :class:`AsmEmulator`."""
 
     RENAMED: ClassVar = {
@@ -55,13 +54,13 @@ class AsmEmulator(Emulator):
     """The adaptive secondary of a system behind a TCP port, in its own thread.
 
     Options: ``system`` (default ``maps-nir``), ``contaminated`` (further contaminated actuators,
-    ``17,18``), ``fault`` (kinds: :data:`~escape_sim.emulators.asm.connection.FAULT_KINDS`),
+    ``17,18``), ``fault`` (kinds: :data:`~escape_sim.emulators.asm.server.FAULT_KINDS`),
     ``transition_speed`` (factor on the speed of state transitions), ``hold_s`` and ``rest_s`` (watchdog,
     seconds), ``versions`` (lowest and highest supported, ``1,1``).
     """
 
     def __init__(self, request: EmulatorRequest) -> None:
-        options = AsmOptions.from_request(request)
+        options = AsmEmulatorOptions.from_request(request)
         config = request.config or load_system(options.system)
         dm = config.devices.dm
         bench = shared_bench(config, request.shared) if request.shared is not None else None
