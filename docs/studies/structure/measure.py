@@ -3,19 +3,25 @@
     python docs/studies/structure/measure.py [ROOT]
 
 Counts, for every package under ROOT (default: the repository that contains this file): modules, source lines,
-public names, functions longer than 60 lines; and for the whole tree: public class names that are defined more
-than once, and import cycles (imports under ``TYPE_CHECKING`` and inside functions included).
+public names, functions longer than 60 lines; and for the whole tree: lines with code and of documentation
+strings, public class names that are defined more than once, and import cycles (imports under
+``TYPE_CHECKING`` and inside functions included).
 """
 
 from __future__ import annotations
 
 import ast
+import io
 import sys
+import tokenize
 from collections import Counter
 from pathlib import Path
 
 SOURCE_FOLDERS = ("escape_hw", "escape_gui", "drivers", "sim_backends", "benchmarks", "docs", "examples")
 LONG_FUNCTION = 60
+_NO_CODE = {
+    tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER,
+}  # fmt: skip
 
 
 def package_of(path: Path) -> str:
@@ -32,6 +38,26 @@ def module_name(path: Path) -> str:
     if parts[0] in ("drivers", "sim_backends", "benchmarks") and len(parts) > 1:
         parts = parts[1:]
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def documentation_lines(tree: ast.Module) -> set[int]:
+    """Numbers of the lines of documentation strings."""
+    lines: set[int] = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef) and (
+            ast.get_docstring(node, clean=False) is not None
+        ):
+            lines |= set(range(node.body[0].lineno, (node.body[0].end_lineno or 0) + 1))
+    return lines
+
+
+def code_lines(text: str) -> set[int]:
+    """Numbers of the lines with code or documentation strings: neither empty nor comments only."""
+    lines: set[int] = set()
+    for token in tokenize.generate_tokens(io.StringIO(text).readline):
+        if token.type not in _NO_CODE:
+            lines |= set(range(token.start[0], token.end[0] + 1))
+    return lines
 
 
 def imported_modules(tree: ast.Module, modules: set[str]) -> set[str]:
@@ -87,13 +113,14 @@ def main(root: Path) -> None:
         for path in (root / folder).rglob("*.py")
         if "_build" not in path.parts
     )
-    trees = {path: ast.parse((root / path).read_text(encoding="utf-8")) for path in files}
+    texts = {path: (root / path).read_text(encoding="utf-8") for path in files}
+    trees = {path: ast.parse(text) for path, text in texts.items()}
     lines, modules, public, long = Counter[str](), Counter[str](), Counter[str](), Counter[str]()
     classes: dict[str, list[str]] = {}
     for path, tree in trees.items():
         package = package_of(path)
         modules[package] += 1
-        lines[package] += len((root / path).read_text(encoding="utf-8").splitlines())
+        lines[package] += len(texts[path].splitlines())
         for node in tree.body:
             if isinstance(node, ast.FunctionDef | ast.ClassDef) and not node.name.startswith("_"):
                 public[package] += 1
@@ -107,6 +134,9 @@ def main(root: Path) -> None:
     for package in sorted(modules):
         print(f"| {package} | {modules[package]} | {lines[package]} | {public[package]} | {long[package]} |")
     print(f"| **all** | {modules.total()} | {lines.total()} | {public.total()} | {long.total()} |\n")
+    documentation = {path: documentation_lines(tree) for path, tree in trees.items()}
+    n_code = sum(len(code_lines(text) - documentation[path]) for path, text in texts.items())
+    print(f"Lines with code: {n_code}; of documentation strings: {sum(map(len, documentation.values()))}\n")
     twice = {name: where for name, where in classes.items() if len(where) > 1}
     print(f"Public class names defined more than once: {len(twice)}\n")
     for name, where in sorted(twice.items()):
