@@ -37,8 +37,14 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 
+#: Signals that stop a command in an orderly way: Ctrl-C, a closed terminal, ``kill``, and Ctrl-\\.
+STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
+
+
 class InterruptHandler:
-    """Turns SIGINT and SIGTERM into an orderly stop; does nothing outside the main thread.
+    """Turns every signal of :data:`STOP_SIGNALS` into an orderly stop; does nothing outside the main thread.
+
+    A hang-up that the process was started to ignore, as by ``nohup``, stays ignored.
 
     While a procedure runs, the first signal sets ``abort`` and the second raises ``KeyboardInterrupt``.
     While the devices are being closed or an aborted run is saved, signals are ignored, so that the mirror
@@ -56,7 +62,9 @@ class InterruptHandler:
     def __enter__(self) -> Self:
         """Install the handlers."""
         if threading.current_thread() is threading.main_thread():
-            for number in (signal.SIGINT, signal.SIGTERM):
+            for number in STOP_SIGNALS:
+                if number == signal.SIGHUP and signal.getsignal(number) is signal.SIG_IGN:
+                    continue
                 self._previous[number] = signal.signal(number, self._handle)
         return self
 
