@@ -145,8 +145,9 @@ class CommandGuard:
             return _read_only(safe), GuardReport(clipped, slewed, disabled, scale, removed)
 
     def set_last(self, shape: NDArray[np.float64]) -> None:
-        """Store a shape from :meth:`limit` as the present shape of the mirror."""
-        self.last = shape
+        """Store a copy of a shape from :meth:`limit` as the present shape of the mirror."""
+        # Driver, callbacks and caller hold the array itself and can make it writable again.
+        self.last = _read_only(shape.copy())
         self._possible = None
 
     def mark_uncertain(self, shape: NDArray[np.float64]) -> None:
@@ -340,6 +341,6 @@ def _clamp(values: NDArray[np.float64], bound: float) -> NDArray[np.float64]:
 
 
 def _read_only(shape: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Make an array read-only, because caller, driver and guard share it."""
+    """Make an array read-only, because caller, driver and callbacks share it."""
     shape.setflags(write=False)
     return shape
