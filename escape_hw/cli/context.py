@@ -23,6 +23,7 @@ from rich.console import Console, RenderableType
 from escape_hw.api.concurrency import SignalSafeFlag
 from escape_hw.deprecation import RenamedWarning
 from escape_hw.errors import Aborted, ConfigError, EscapeError, StorageError
+from escape_hw.runtime.display.console import DisplayConsole
 from escape_hw.runtime.procedures.declaration import ComputedProcedure
 
 if TYPE_CHECKING:
@@ -129,7 +130,7 @@ class CommandContext:
     def __init__(self, command: str, json: bool, quiet: bool) -> None:
         self.command, self.json, self.quiet = command, json, quiet
         self._stdout = sys.stdout
-        self.errors = Console(stderr=True)
+        self.errors = DisplayConsole()
         # Output to a pipe or a file has no terminal width.
         self.tables = Console(file=self._stdout, width=None if self._stdout.isatty() else _PIPE_WIDTH)
         self.interrupts = InterruptHandler(self._notify_from_signal_handler)
@@ -146,8 +147,9 @@ class CommandContext:
         return time.monotonic() - self._began
 
     def notify(self, line: str) -> None:
-        """Print a line for the operator on standard error."""
-        self.errors.print(line, highlight=False, markup=False, soft_wrap=True)
+        """Print a line for the operator on standard error, as far as it can be written."""
+        with contextlib.suppress(OSError):
+            self.errors.print(line, highlight=False, markup=False, soft_wrap=True)
 
     def _notify_from_signal_handler(self, line: str) -> None:
         """Print without the stream, which refuses a write from a handler that interrupted another write."""

@@ -171,7 +171,8 @@ def test_what_was_kept_can_be_used(start, escape, system, tmp_path):
 def test_a_hang_up_is_ignored_under_nohup(start, system, tmp_path):
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
-        running = start("calibrate", system, "--method", "docrime", "--frames", 3000, "--out", tmp_path / "run")
+        out = tmp_path / "run"
+        running = start("calibrate", system, "--method", "docrime", "--frames", 3000, "--out", out)
     finally:
         signal.signal(signal.SIGHUP, before)
     running.wait_for("DO-CRIME")

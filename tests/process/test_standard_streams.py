@@ -119,3 +119,15 @@ def test_a_run_whose_progress_is_not_read_is_finished(bare, system, tmp_path, en
     assert (tmp_path / "run" / "im.fits").is_file()
     assert "Traceback" not in (tmp_path / "run" / "run.log").read_text()
     assert done.stdout
+
+
+@pytest.mark.parametrize("bare", ["buffered"], indirect=True)
+def test_a_loop_whose_streams_share_a_pipe_without_a_reader_keeps_its_data(bare, system, im, tmp_path):
+    """As ``escape loop ... 2>&1 | head -1``."""
+    nobody = without_reader()
+    words = ("loop", system, "--im", im, "--frames", 300, "--out", tmp_path / "run")
+    done = ended(words, bare, stdout=nobody, stderr=nobody)
+    os.close(nobody)
+    assert done.returncode == 1, "the results could not be printed"
+    assert (tmp_path / "run" / "loop.fits").is_file()
+    assert "Traceback" not in (tmp_path / "run" / "run.log").read_text()

@@ -13,7 +13,7 @@ from escape_hw.api.mirror import DeformableMirror
 from escape_hw.testing.reference_devices import IdealSecondary, RecordingMirror, SyntheticCamera
 
 FINAL = [
-    (RecordingMirror, DeformableMirror, ("send", "check", "is_legal", "flatten", "set_flat", "open", "close")),
+    (RecordingMirror, DeformableMirror, ("send", "check", "flatten", "set_flat", "open", "close")),
     (IdealSecondary, AdaptiveSecondary, ("_send", "go_to", "recover")),
     (SyntheticCamera, Device, ("open", "close")),
 ]
