@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from types import FrameType, TracebackType
-from typing import TYPE_CHECKING, Any, Self, TypeVar
+from typing import TYPE_CHECKING, Any, Self, TypeGuard, TypeVar
 
 import typer
 from rich.console import Console, RenderableType
@@ -340,6 +340,9 @@ class CommandContext:
             return USAGE, type(error).__name__, str(error)
         if isinstance(error, EscapeError):
             return error.exit_code, type(error).__name__, str(error)
+        if _is_file_error(error):
+            message = f"{_shorten(os.fsdecode(error.filename))}: {error.strerror or error}"
+            return (FAILED if self.devices_opened else USAGE), "StorageError", message
         message = f"{type(error).__name__}: {error} (this is a defect of ESCAPE)"
         if self.folder is not None and self.folder.path.is_dir():
             # The run folder has logged the traceback.
@@ -356,6 +359,16 @@ class CommandContext:
             document, self._document = self._document, None
             self._stdout.write(dumps(document) + "\n")
             self._stdout.flush()
+
+
+def _is_file_error(error: BaseException) -> TypeGuard[OSError]:
+    """Whether a file or folder of this computer is the cause, such as a home directory that cannot be read."""
+    return isinstance(error, OSError) and error.filename is not None
+
+
+def _shorten(path: str, length: int = 300) -> str:
+    """A path for a message; the middle of a very long one is left out."""
+    return path if len(path) <= length else f"{path[: length // 2]}...{path[-length // 2 :]}"
 
 
 @contextmanager
@@ -393,7 +406,8 @@ def command_context(command: str, *, json: bool = False, quiet: bool = False) ->
         except (EscapeError, KeyboardInterrupt) as error:
             context.code = context.fail(error)
         except Exception as error:
-            log.exception("unexpected")
+            if not _is_file_error(error):
+                log.exception("unexpected")
             context.code = context.fail(error)
     context.print_document()
     raise typer.Exit(context.code)
