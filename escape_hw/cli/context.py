@@ -362,7 +362,7 @@ class CommandContext:
 
 
 def _is_file_error(error: BaseException) -> TypeGuard[OSError]:
-    """Whether a file or folder of this computer is the cause, such as a home directory that cannot be read."""
+    """Whether a file or folder of this computer is the cause, such as an unreadable home directory."""
     return isinstance(error, OSError) and error.filename is not None
 
 

@@ -144,7 +144,8 @@ LOCALES = {
 @pytest.mark.parametrize("bare", ["buffered"], indirect=True)
 @pytest.mark.parametrize("locale", LOCALES)
 @pytest.mark.parametrize(
-    ("words", "code"), [(("--help",), 0), (("doctor",), None), (("show", "n\N{LATIN SMALL LETTER O WITH DIAERESIS}"), 2)],
+    ("words", "code"),
+    [(("--help",), 0), (("doctor",), None), (("show", "n\N{LATIN SMALL LETTER O WITH DIAERESIS}"), 2)],
     ids=["help", "doctor", "path"],
 )  # fmt: skip
 def test_every_locale(bare, locale, words, code):
