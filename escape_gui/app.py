@@ -172,7 +172,7 @@ def _find_or_start_server(system: str, address: str) -> tuple[str, LocalServer |
 
 @contextmanager
 def _close_on_signals(qt_app: QApplication) -> Iterator[None]:
-    """Close all windows on Ctrl-C and SIGTERM, because Qt swallows an exception raised in a slot.
+    """Close all windows on Ctrl-C, SIGTERM and SIGHUP, because Qt swallows an exception raised in a slot.
 
     Python runs the handler at the next tick of the window's timer.
     """
@@ -180,7 +180,8 @@ def _close_on_signals(qt_app: QApplication) -> Iterator[None]:
     def close(*_: object) -> None:
         QTimer.singleShot(0, qt_app.closeAllWindows)
 
-    previous_handlers = {number: signal.signal(number, close) for number in (signal.SIGINT, signal.SIGTERM)}
+    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    previous_handlers = {number: signal.signal(number, close) for number in numbers}
     try:
         yield
     finally:

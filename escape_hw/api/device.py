@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import abc
+import inspect
 import logging
 import threading
 import time
@@ -20,6 +21,23 @@ class Device(abc.ABC):
     ``open`` and ``close`` are idempotent and thread-safe. Nothing happens on garbage collection, and no
     vendor library is loaded before ``open``. Drivers implement ``_open`` and ``_close``.
     """
+
+    def __init_subclass__(cls, **options: object) -> None:
+        """Refuse a class that replaces a final method, such as the opening, or the ``send`` of a mirror.
+
+        Raises
+        ------
+        TypeError
+            Names the method.
+        """
+        super().__init_subclass__(**options)
+        for base in cls.__mro__[1:]:
+            for name, member in vars(base).items():
+                if getattr(member, "__final__", False) and inspect.getattr_static(cls, name) is not member:
+                    raise TypeError(
+                        f"{cls.__name__}.{name} replaces a final method of {base.__name__}; "
+                        "implement the hooks of its interface instead"
+                    )
 
     def __init__(self, name: str) -> None:
         self.name = name

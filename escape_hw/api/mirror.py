@@ -109,7 +109,7 @@ class DeformableMirror(Device):
 
     @property
     def shape(self) -> NDArray[np.float64]:
-        """The last command sent, ``(n_act,)`` (a copy)."""
+        """The last command that the mirror accepted, ``(n_act,)`` (a copy)."""
         return self._guard_when_open().last.copy()
 
     @property
@@ -145,7 +145,8 @@ class DeformableMirror(Device):
         CommandRejected
             Malformed or not finite; nothing is sent.
         DeviceError
-            The transfer failed.
+            The transfer failed. The mirror has either shape: until a transfer succeeds, the slew rule is
+            obeyed from both, and ``flatten`` sends.
         """
         # Locked because the slew rule refers to the previous command that reached the mirror.
         with self._lock:
@@ -155,7 +156,13 @@ class DeformableMirror(Device):
             except CommandRejected:
                 self.rejected_count += 1
                 raise
-            kept_shape = self._send(safe)
+            try:
+                kept_shape = self._send(safe)
+            except BaseException:
+                # The command may have reached the mirror although its acknowledgement did not arrive.
+                self._shape_known = False
+                guard.mark_uncertain(safe)
+                raise
             shape = safe if kept_shape is None else kept_shape
             guard.set_last(shape)
             self._shape_known = True
@@ -206,8 +213,9 @@ class DeformableMirror(Device):
             target = self.flat
             step = min(self.RAMP_STEP, self.limits.max_slew or self.RAMP_STEP)
             distance = float(np.abs(target - guard.last).max(initial=0.0))
-            # Twice the direct number of steps, because the way out of an illegal shape is longer.
-            for _ in range(2 + 2 * math.ceil(distance / step)):
+            # Twice the direct number of steps, because the way out of an illegal shape is longer; one more,
+            # because the first step after a failed transfer may lead to the last shape only.
+            for _ in range(3 + 2 * math.ceil(distance / step)):
                 move = target - guard.last
                 largest = float(np.abs(move).max(initial=0.0))
                 if largest == 0.0 and self._shape_known:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 
+from escape_hw.cli.caches import provide_caches
 from escape_hw.cli.output import OutputStreams
 
 
@@ -15,6 +16,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Run ``escape``; ends the process with the command's exit code."""
     with OutputStreams(document="--json" in (sys.argv[1:] if arguments is None else arguments)) as output:
         try:
+            provide_caches()
             from escape_hw.cli.app import run
 
             run(arguments)

@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from types import FrameType, TracebackType
-from typing import TYPE_CHECKING, Any, Self, TypeVar
+from typing import TYPE_CHECKING, Any, Self, TypeGuard, TypeVar
 
 import typer
 from rich.console import Console, RenderableType
@@ -23,6 +23,7 @@ from rich.console import Console, RenderableType
 from escape_hw.api.concurrency import SignalSafeFlag
 from escape_hw.deprecation import RenamedWarning
 from escape_hw.errors import Aborted, ConfigError, EscapeError, StorageError
+from escape_hw.runtime.display.console import DisplayConsole
 from escape_hw.runtime.procedures.declaration import ComputedProcedure
 
 if TYPE_CHECKING:
@@ -37,8 +38,14 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 
+#: Signals that stop a command in an orderly way: Ctrl-C, a closed terminal, ``kill``, and Ctrl-\\.
+STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
+
+
 class InterruptHandler:
-    """Turns SIGINT and SIGTERM into an orderly stop; does nothing outside the main thread.
+    """Turns every signal of :data:`STOP_SIGNALS` into an orderly stop; does nothing outside the main thread.
+
+    A hang-up that the process was started to ignore, as by ``nohup``, stays ignored.
 
     While a procedure runs, the first signal sets ``abort`` and the second raises ``KeyboardInterrupt``.
     While the devices are being closed or an aborted run is saved, signals are ignored, so that the mirror
@@ -56,7 +63,9 @@ class InterruptHandler:
     def __enter__(self) -> Self:
         """Install the handlers."""
         if threading.current_thread() is threading.main_thread():
-            for number in (signal.SIGINT, signal.SIGTERM):
+            for number in STOP_SIGNALS:
+                if number == signal.SIGHUP and signal.getsignal(number) is signal.SIG_IGN:
+                    continue
                 self._previous[number] = signal.signal(number, self._handle)
         return self
 
@@ -121,7 +130,7 @@ class CommandContext:
     def __init__(self, command: str, json: bool, quiet: bool) -> None:
         self.command, self.json, self.quiet = command, json, quiet
         self._stdout = sys.stdout
-        self.errors = Console(stderr=True)
+        self.errors = DisplayConsole()
         # Output to a pipe or a file has no terminal width.
         self.tables = Console(file=self._stdout, width=None if self._stdout.isatty() else _PIPE_WIDTH)
         self.interrupts = InterruptHandler(self._notify_from_signal_handler)
@@ -138,8 +147,9 @@ class CommandContext:
         return time.monotonic() - self._began
 
     def notify(self, line: str) -> None:
-        """Print a line for the operator on standard error."""
-        self.errors.print(line, highlight=False, markup=False, soft_wrap=True)
+        """Print a line for the operator on standard error, as far as it can be written."""
+        with contextlib.suppress(OSError):
+            self.errors.print(line, highlight=False, markup=False, soft_wrap=True)
 
     def _notify_from_signal_handler(self, line: str) -> None:
         """Print without the stream, which refuses a write from a handler that interrupted another write."""
@@ -330,6 +340,9 @@ class CommandContext:
             return USAGE, type(error).__name__, str(error)
         if isinstance(error, EscapeError):
             return error.exit_code, type(error).__name__, str(error)
+        if _is_file_error(error):
+            message = f"{_shorten(os.fsdecode(error.filename))}: {error.strerror or error}"
+            return (FAILED if self.devices_opened else USAGE), "StorageError", message
         message = f"{type(error).__name__}: {error} (this is a defect of ESCAPE)"
         if self.folder is not None and self.folder.path.is_dir():
             # The run folder has logged the traceback.
@@ -346,6 +359,16 @@ class CommandContext:
             document, self._document = self._document, None
             self._stdout.write(dumps(document) + "\n")
             self._stdout.flush()
+
+
+def _is_file_error(error: BaseException) -> TypeGuard[OSError]:
+    """Whether a file or folder of this computer is the cause, such as an unreadable home directory."""
+    return isinstance(error, OSError) and error.filename is not None
+
+
+def _shorten(path: str, length: int = 300) -> str:
+    """A path for a message; the middle of a very long one is left out."""
+    return path if len(path) <= length else f"{path[: length // 2]}...{path[-length // 2 :]}"
 
 
 @contextmanager
@@ -383,7 +406,8 @@ def command_context(command: str, *, json: bool = False, quiet: bool = False) ->
         except (EscapeError, KeyboardInterrupt) as error:
             context.code = context.fail(error)
         except Exception as error:
-            log.exception("unexpected")
+            if not _is_file_error(error):
+                log.exception("unexpected")
             context.code = context.fail(error)
     context.print_document()
     raise typer.Exit(context.code)

@@ -1,4 +1,4 @@
-"""Standard streams of the command line that survive a closed pipe or a full disk.
+"""Standard streams of the command line that survive a closed pipe, a full disk and any locale.
 
 Python writes buffered output when the interpreter exits, too late to change the exit code. The streams are
 therefore flushed before the exit code is decided.
@@ -19,6 +19,35 @@ T = TypeVar("T")
 _FAILED = 1
 
 
+#: Replacements for signs in the output that are not in ASCII.
+_ASCII_SIGNS = str.maketrans(
+    {
+        "\N{MIDDLE DOT}": "-", "\N{BULLET}": "*", "\N{EN DASH}": "-", "\N{EM DASH}": "-",
+        "\N{MULTIPLICATION SIGN}": "x", "\N{PLUS-MINUS SIGN}": "+-", "\N{MICRO SIGN}": "u",
+        "\N{GREEK SMALL LETTER MU}": "u", "\N{DEGREE SIGN}": "deg", "\N{HORIZONTAL ELLIPSIS}": "...",
+        "\N{RIGHTWARDS ARROW}": "->", "\N{LESS-THAN OR EQUAL TO}": "<=", "\N{GREATER-THAN OR EQUAL TO}": ">=",
+        "\N{MINUS SIGN}": "-", "\N{ALMOST EQUAL TO}": "~", "\N{GREEK SMALL LETTER ALPHA}": "alpha",
+        "\N{GREEK SMALL LETTER LAMDA}": "lambda", "\N{GREEK SMALL LETTER SIGMA}": "sigma",
+        "\N{GREEK SMALL LETTER CHI}": "chi", "\N{GREEK CAPITAL LETTER DELTA}": "Delta",
+        "\N{CHECK MARK}": "+", "\N{BALLOT X}": "x", "\N{SUPERSCRIPT TWO}": "^2",
+        **{chr(code): "+" for code in range(0x2500, 0x2580)},
+        "\N{BOX DRAWINGS LIGHT HORIZONTAL}": "-", "\N{BOX DRAWINGS HEAVY HORIZONTAL}": "-",
+        "\N{BOX DRAWINGS LIGHT VERTICAL}": "|", "\N{BOX DRAWINGS HEAVY VERTICAL}": "|",
+    }
+)  # fmt: skip
+
+
+def encodable(text: str, encoding: str | None) -> str:
+    """The text in signs of an encoding: others become similar signs of ASCII, or escape sequences."""
+    if encoding is None:
+        return text
+    try:
+        text.encode(encoding)
+    except UnicodeEncodeError:
+        return text.translate(_ASCII_SIGNS).encode(encoding, "backslashreplace").decode(encoding)
+    return text
+
+
 class FaultTolerantStream:
     """A text stream that never raises; output that cannot be written is discarded.
 
@@ -35,8 +64,9 @@ class FaultTolerantStream:
         self.inner = inner
 
     def write(self, text: str) -> int:
-        """Write, or discard if the stream has failed."""
-        self._attempt(lambda: self.inner.write(text))
+        """Write, or discard if the stream has failed; signs that the encoding lacks are replaced."""
+        writable = encodable(text, getattr(self.inner, "encoding", None))
+        self._attempt(lambda: self.inner.write(writable))
         return len(text)
 
     def writelines(self, lines: Iterable[str]) -> None:
@@ -58,7 +88,11 @@ class FaultTolerantStream:
             if self._absent and writes:
                 raise OSError(errno.EBADF, os.strerror(errno.EBADF))
             action()
-        except OSError as error:
+        except (OSError, ValueError) as failure:
+            # A ValueError: the stream has been closed.
+            error = (
+                failure if isinstance(failure, OSError) else OSError(errno.EBADF, os.strerror(errno.EBADF))
+            )
             self._works = False
             with contextlib.suppress(OSError, ValueError):
                 # Otherwise Python writes the buffer on exit and fails again.

@@ -6,6 +6,7 @@ import importlib.resources
 import os
 from pathlib import Path
 
+from escape_hw.bounded_files import MAX_TEXT_BYTES, read_bounded
 from escape_hw.config.key_tree import closest_match
 from escape_hw.errors import ConfigError
 
@@ -50,12 +51,17 @@ def find_system(system: str | os.PathLike[str]) -> tuple[str, str]:
         Unknown name, or an unreadable file.
     """
     name = os.fspath(system)
-    path = Path(name).expanduser()
+    try:
+        path = Path(name).expanduser()
+    except RuntimeError as error:
+        raise ConfigError(f"{name}: cannot be read ({error})") from error
     if isinstance(system, str) and path.suffix != _SUFFIX and len(path.parts) < 2:
         return bundled_text(name), name + _SUFFIX
     try:
-        return path.read_text(encoding="utf-8"), name
+        return read_bounded(path, MAX_TEXT_BYTES).decode("utf-8"), name
     except UnicodeDecodeError as error:
         raise ConfigError(f"{name}: is not UTF-8 text ({error.reason} at byte {error.start})") from error
-    except OSError as error:
-        raise ConfigError(f"{name}: cannot be read ({error.strerror})") from error
+    except (OSError, ValueError) as error:
+        shown = name if len(name) <= 300 else f"{name[:150]}...{name[-150:]}"
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise ConfigError(f"{shown}: cannot be read ({reason})") from error

@@ -219,9 +219,13 @@ class MirrorConfig(DeviceConfig):
     def _rules(self) -> Self:
         last = self.n_act - 1
         bad = [i for i in self.limits.disabled if i > last]
-        raise_violations(
+        violations = [
             RuleViolation("limits.disabled", i, f"the actuators are numbered 0 to {last}") for i in bad
-        )
+        ]
+        if len(set(self.limits.disabled)) == self.n_act and not bad:
+            text = "disables every actuator; leave at least one in service"
+            violations.append(RuleViolation("limits.disabled", list(self.limits.disabled), text))
+        raise_violations(violations)
         return self
 
 

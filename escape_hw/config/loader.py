@@ -19,12 +19,14 @@ from escape_hw.config.key_tree import KeyPath
 from escape_hw.config.renamed import present_key, update_document, update_override
 from escape_hw.config.section import RULE_ERROR
 from escape_hw.config.system import SystemConfig
-from escape_hw.config.toml_text import format_value, key_lines, line_of
+from escape_hw.config.toml_text import format_value, key_lines, line_of, parse_toml
 from escape_hw.deprecation import warn_renamed
 from escape_hw.errors import ConfigError
 
 #: Longest value quoted in a message, characters.
 _MAX_LENGTH = 60
+#: Most problems listed in one error.
+_MAX_PROBLEMS = 20
 
 #: pydantic error type -> message.
 _MESSAGES = {
@@ -68,11 +70,13 @@ def unknown_key_problem(path: Sequence[str | int], value: Any) -> ConfigProblem:
 
 
 def problems_from(error: ValidationError) -> list[ConfigProblem]:
-    """Problems found by a validation, without repetitions, in the order of the models."""
+    """The first problems found by a validation, without repetitions, in the order of the models."""
     found: dict[tuple[KeyPath, str], ConfigProblem] = {}
     for detail in error.errors(include_url=False):
         for problem in _translate(detail):
             found.setdefault((problem.path, problem.message), problem)
+        if len(found) > _MAX_PROBLEMS:
+            break
     return list(found.values())
 
 
@@ -165,7 +169,7 @@ def parse_override(text: str) -> Override:
         raise ConfigError(f"--set  {text!r} is not of the form section.key=value")
     raw = raw.strip()
     try:
-        document = tomllib.loads(f"value = {raw}")
+        document = parse_toml(f"value = {raw}")
     except tomllib.TOMLDecodeError as error:
         if not _BARE_WORD.match(raw):
             raise ConfigError(f"--set  {key.strip()}: {raw}  is not a TOML value: {error}") from None
@@ -247,7 +251,7 @@ def load_text(
     """Load a configuration from TOML text; ``source`` names it in messages. See :func:`load_system`."""
     changes, lines = _parse_changes(overrides, seed, mode)
     try:
-        document = tomllib.loads(text)
+        document = parse_toml(text)
     except tomllib.TOMLDecodeError as error:
         raise ConfigError("\n".join([_syntax_line(error, text, source), *lines])) from None
     places = key_lines(text)
@@ -268,6 +272,10 @@ def load_text(
         *(problem.line(change.origin) for change, problem in rejected),
     ]
     if config is None or messages:
+        if len(messages) > _MAX_PROBLEMS:
+            messages[_MAX_PROBLEMS:] = [
+                f"{source}  has further problems; the first {_MAX_PROBLEMS} are listed"
+            ]
         raise ConfigError("\n".join(messages))
     return config
 

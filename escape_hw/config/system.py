@@ -23,6 +23,9 @@ from escape_hw.config.toml_text import dump_toml
 from escape_hw.config.twin import TwinConfig
 from escape_hw.errors import ConfigError
 
+#: Fewest pixels across a sub-aperture, those of a quad cell.
+_MIN_SPOT_PX = 2
+
 
 class TelescopeSection(Section):
     """Obscuration of the telescope; the diameter of its pupil is ``system.pupil_m``."""
@@ -287,6 +290,13 @@ class SystemConfig(Section):
         raise_violations([*violations, *self._sensor_rules()])
         return self
 
+    def _region_rules(self, n_sub: int) -> Iterator[RuleViolation]:
+        """The region of a Shack-Hartmann sensor has room for its spots."""
+        region, least = self.devices.wfs.region, _MIN_SPOT_PX * n_sub
+        if min(region[2:]) < least:
+            text = f"is too small for {n_sub} sub-apertures; needs at least {least} x {least} pixels"
+            yield RuleViolation("devices.wfs.region", list(region), text)
+
     def _sensor_rules(self) -> Iterator[RuleViolation]:
         """Rules between the sensor and the other sections."""
         twin = self.twin
@@ -294,6 +304,7 @@ class SystemConfig(Section):
             text = f"is not used with sensor.kind = '{self.sensor.kind}'; remove it"
             for key, value in twin.pyramid.model_dump(exclude_defaults=True).items():
                 yield RuleViolation(f"twin.pyramid.{key}", value, text)
+            yield from self._region_rules(self.sensor.n_sub)
             return
         modulator, radius = self.devices.modulator, self.sensor.modulation
         if radius and modulator is None:

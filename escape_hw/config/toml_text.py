@@ -12,10 +12,41 @@ from typing import Any
 KeyPath = tuple[str | int, ...]
 
 
+#: Deepest nesting of tables and arrays, and longest statement and text whose lines are numbered.
+_MAX_DEPTH, _MAX_STATEMENT_LINES, _MAX_LINES = 32, 1000, 20_000
+
+
+def parse_toml(text: str) -> dict[str, Any]:
+    """Parse TOML text.
+
+    Raises
+    ------
+    tomllib.TOMLDecodeError
+        It is not valid, nested too deeply, or holds a number that is too long; other errors of the parser
+        are not raised.
+    """
+    try:
+        document = tomllib.loads(text)
+    except RecursionError:
+        raise tomllib.TOMLDecodeError("nested too deeply") from None
+    except tomllib.TOMLDecodeError:
+        raise
+    except ValueError as error:
+        raise tomllib.TOMLDecodeError(f"a number is too long ({error})") from None
+    layer: list[Any] = [document]
+    for _ in range(_MAX_DEPTH):
+        tables = [one for one in layer if isinstance(one, (dict, list))]
+        layer = [inner for one in tables for inner in (one.values() if isinstance(one, dict) else one)]
+        if not layer:
+            return document
+    raise tomllib.TOMLDecodeError(f"nested more than {_MAX_DEPTH} levels deep")
+
+
 def key_lines(text: str) -> dict[KeyPath, int]:
     """Line number, from 1, of each key and each table of a valid TOML text.
 
-    A statement ends at the first line end at which it parses, so no separate scanner is needed.
+    A statement ends at the first line end at which it parses, so no separate scanner is needed. Lines after
+    a very long statement, or of a very long text, are not numbered.
     """
     lines: dict[KeyPath, int] = {}
     table: KeyPath = ()
@@ -51,7 +82,9 @@ def line_of(lines: dict[KeyPath, int], path: KeyPath) -> int | None:
 def _statements(text: str) -> Iterator[tuple[int, str]]:
     pending: list[str] = []
     start = 1
-    for number, line in enumerate(text.splitlines(), start=1):
+    for number, line in enumerate(text.splitlines()[:_MAX_LINES], start=1):
+        if len(pending) >= _MAX_STATEMENT_LINES:
+            return
         if not pending:
             if not line.strip() or line.lstrip().startswith("#"):
                 continue

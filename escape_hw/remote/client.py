@@ -97,13 +97,12 @@ class RemoteRun:
         ServerGone
             The server has been silent for too long.
         """
-        from rich.console import Console
-
+        from escape_hw.runtime.display.console import DisplayConsole
         from escape_hw.runtime.display.progress import ProgressView
 
         deadline = None if timeout_s is None else time.monotonic() + timeout_s
         last_message_s = time.monotonic()
-        with ProgressView(Console(file=sys.stderr)) if progress else nullcontext() as view:
+        with ProgressView(DisplayConsole()) if progress else nullcontext() as view:
             while (ended := self._connection.wait_for(self.id, 0.2)) is None:
                 now = time.monotonic()
                 last_message_s = now if self._connection.connected else last_message_s

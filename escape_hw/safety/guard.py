@@ -87,6 +87,8 @@ class CommandGuard:
         n_enabled = int(self._enabled.sum())
         self._mean_weights = self._enabled / n_enabled if n_enabled else np.zeros(n_act)
         self.last = _read_only(np.zeros(n_act))
+        # Least and greatest command per actuator that the mirror may have, after a transfer that failed.
+        self._possible: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
         # Imported here because numba is slow to import and reading a configuration does not need it.
         from escape_hw.safety.compiled_check import obeys_limits
 
@@ -143,8 +145,19 @@ class CommandGuard:
             return _read_only(safe), GuardReport(clipped, slewed, disabled, scale, removed)
 
     def set_last(self, shape: NDArray[np.float64]) -> None:
-        """Store a shape from :meth:`limit` as the present shape of the mirror."""
-        self.last = shape
+        """Store a copy of a shape from :meth:`limit` as the present shape of the mirror."""
+        # Driver, callbacks and caller hold the array itself and can make it writable again.
+        self.last = _read_only(shape.copy())
+        self._possible = None
+
+    def mark_uncertain(self, shape: NDArray[np.float64]) -> None:
+        """Store a shape from :meth:`limit` whose transfer failed: the mirror may have it, or not.
+
+        Until a shape is known again (:meth:`set_last`, :meth:`reset`), the slew rule is obeyed from the last
+        shape and from every uncertain one. Returning to the last shape is always possible.
+        """
+        lowest, highest = (self.last, self.last) if self._possible is None else self._possible
+        self._possible = np.minimum(lowest, shape), np.maximum(highest, shape)
 
     def __call__(self, command: ArrayLike) -> tuple[NDArray[np.float64], GuardReport]:
         """:meth:`limit`, then :meth:`set_last`."""
@@ -161,10 +174,12 @@ class CommandGuard:
             The shape is malformed, see :meth:`validate`.
         """
         self.last = _read_only(np.zeros(self.n_act) if shape is None else self.validate(shape))
+        self._possible = None
 
     def is_legal(self, shape: NDArray[np.float64]) -> bool:
-        """True when ``shape`` obeys every rule, the slew rule relative to the last shape."""
-        return bool(self._obeys_limits(shape, self.last, *self._rules))
+        """True when ``shape`` obeys every rule, the slew rule relative to every shape the mirror may have."""
+        references = (self.last,) if self._possible is None else (self.last, *self._possible)
+        return all(self._obeys_limits(shape, reference, *self._rules) for reference in references)
 
     def find_violation(self, shape: NDArray[np.float64]) -> str | None:
         """Message for the first rule other than slew that ``shape`` breaks, or ``None``."""
@@ -287,14 +302,28 @@ class CommandGuard:
         if slew is None:
             return legal, 0
         move = legal - self.last
+        backward, forward = self._slew_bounds(slew)
+        bound = np.where(move < 0, backward, forward)
         far = np.abs(move)
-        slewed = int(np.count_nonzero(far > slew + _ROUNDING))
+        slewed = int(np.count_nonzero(far > bound + _ROUNDING))
         if not slewed:
             return legal, 0
-        each = self._within_stroke(self.last + _clamp(move, slew))
+        each = self._within_stroke(self.last + np.minimum(np.maximum(move, -backward), forward))
         if self.is_legal(each):
             return each, slewed
-        return self._within_stroke(self.last + move * (slew / far.max())), slewed
+        moving = far > 0
+        fraction = float((bound[moving] / far[moving]).min(initial=1.0))
+        return self._within_stroke(self.last + move * fraction), slewed
+
+    def _slew_bounds(self, slew: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Largest moves ``(n_act,)`` from the last shape towards lower and higher commands, both positive.
+
+        A command lies within the slew limit of every shape that the mirror may have.
+        """
+        lowest, highest = (self.last, self.last) if self._possible is None else self._possible
+        backward = np.maximum(slew - (highest - self.last), 0.0)
+        forward = np.maximum(slew - (self.last - lowest), 0.0)
+        return backward, forward
 
     def _within_stroke(self, shape: NDArray[np.float64]) -> NDArray[np.float64]:
         """Remove rounding beyond the stroke limit, or beyond the last shape if that exceeds the limit."""
@@ -312,6 +341,6 @@ def _clamp(values: NDArray[np.float64], bound: float) -> NDArray[np.float64]:
 
 
 def _read_only(shape: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Make an array read-only, because caller, driver and guard share it."""
+    """Make an array read-only, because caller, driver and callbacks share it."""
     shape.setflags(write=False)
     return shape

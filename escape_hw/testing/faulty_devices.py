@@ -53,6 +53,9 @@ class FaultyMirror(_Wrapper, DeformableMirror):
         the life of this object and including the ramps of ``flatten``.
     lost_from
         Number of the transfer from which all fail with :class:`~escape_hw.errors.DeviceLost`.
+    unacknowledged
+        Numbers of the transfers that reach the inner mirror and fail with
+        :class:`~escape_hw.errors.DeviceError` afterwards.
 
     Attributes
     ----------
@@ -66,11 +69,13 @@ class FaultyMirror(_Wrapper, DeformableMirror):
         *,
         fail_sends: Collection[int] = (),
         lost_from: int | None = None,
+        unacknowledged: Collection[int] = (),
     ) -> None:
         super().__init__(inner.name, inner.limits)
         self.inner: DeformableMirror = inner
         self.fail_sends = frozenset(fail_sends)
         self.lost_from = lost_from
+        self.unacknowledged = frozenset(unacknowledged)
         self.reached: list[NDArray[np.float64]] = []
         self.transfers = 0
 
@@ -91,6 +96,8 @@ class FaultyMirror(_Wrapper, DeformableMirror):
             raise DeviceError(self.name, f"transfer {number} failed (injected)")
         report = self.inner.send(command)
         self.reached.append(report.sent.copy())
+        if number in self.unacknowledged:
+            raise DeviceError(self.name, f"transfer {number} was not acknowledged (injected)")
         return report.sent if report.skipped else None
 
 

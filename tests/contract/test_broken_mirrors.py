@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from broken import broken_class
 
 from escape_hw.api.device import Device
 from escape_hw.api.mirror import DeformableMirror, DMInfo, SendReport
@@ -179,7 +180,7 @@ BROKEN: list[Broken] = [
     ("base", "expected", "defects"), [pytest.param(*case[1:], id=case[0]) for case in BROKEN]
 )
 def test_check_catches(catches: Catches, base: type[Device], expected: str, defects: dict[str, Any]) -> None:
-    catches(type("Broken", (base,), defects), expected)
+    catches(broken_class(base, defects), expected)
 
 
 def test_every_check_is_tested() -> None:

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from broken import broken_class
 
 from escape_hw.api.adaptive_secondary import AdaptiveSecondary, ShellState
 from escape_hw.api.device import Device
@@ -96,7 +97,7 @@ BROKEN: list[tuple[str, str, dict[str, Any]]] = [
 
 @pytest.mark.parametrize(("expected", "defects"), [pytest.param(*case[1:], id=case[0]) for case in BROKEN])
 def test_check_catches(catches: Catches, expected: str, defects: dict[str, Any]) -> None:
-    catches(type("Broken", (IdealSecondary,), defects), expected)
+    catches(broken_class(IdealSecondary, defects), expected)
 
 
 def test_every_check_is_tested() -> None:

@@ -8,6 +8,7 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
+from broken import broken_class
 
 from escape_hw.api.device import Device
 from escape_hw.api.modulator import ModulatorInfo, ModulatorStatus, TipTiltModulator
@@ -101,7 +102,7 @@ BROKEN: list[Broken] = [
     ("base", "expected", "defects"), [pytest.param(*case[1:], id=case[0]) for case in BROKEN]
 )
 def test_check_catches(catches: Catches, base: type[Device], expected: str, defects: dict[str, Any]) -> None:
-    catches(type("Broken", (base,), defects), expected)
+    catches(broken_class(base, defects), expected)
 
 
 def test_every_check_is_tested() -> None:

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import json
+import os
+import pty
+import select
 import shlex
 import signal
 import sys
+import time
 from pathlib import Path
 
 import pytest
+from running import ESCAPE
 
 from escape_hw.io.fits.loop import load_loop
 from escape_hw.io.fits.matrix import load_matrix
@@ -118,12 +123,13 @@ def test_ctrl_c_prints_the_command_to_resume(start, system, tmp_path):
     assert not any("resume with: " in line for line in ended.lines)
 
 
-def test_sigterm(start, system, tmp_path):
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT])
+def test_a_stop_signal(start, system, tmp_path, number):
     out = tmp_path / "run"
     running = start("calibrate", system, "--method", "docrime", "--frames", ENDLESS, "--out", out)
     running.wait_for("DO-CRIME")
     running.let_work(0.5)
-    ended = running.stop(signal.SIGTERM)
+    ended = running.stop(number)
     assert ended.code == 130
     assert ended.document["error"]["type"] == "Aborted"
     check_products(out, [], ["im"])
@@ -160,3 +166,34 @@ def test_what_was_kept_can_be_used(start, escape, system, tmp_path):
     assert loop.returncode == 0, loop.stderr
     assert escape("report", out).returncode == 0
     assert "ABORTED" in (out / "report.html").read_text().upper()
+
+
+def test_a_hang_up_is_ignored_under_nohup(start, system, tmp_path):
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        out = tmp_path / "run"
+        running = start("calibrate", system, "--method", "docrime", "--frames", 3000, "--out", out)
+    finally:
+        signal.signal(signal.SIGHUP, before)
+    running.wait_for("DO-CRIME")
+    assert running.stop(signal.SIGHUP).code == 0
+
+
+def test_a_terminal_that_closes_saves_the_data(system, environment, tmp_path):
+    """As a closed window or a lost ssh connection: a hang-up, and streams that fail from then on."""
+    out = tmp_path / "run"
+    words = ("calibrate", system, "--method", "docrime", "--frames", ENDLESS, "--out", out)
+    pid, terminal = pty.fork()
+    if pid == 0:
+        os.execvpe(ESCAPE[0], [*ESCAPE, *map(str, words)], environment)
+    text = b""
+    working_until = None
+    while working_until is None or time.monotonic() < working_until:
+        assert select.select([terminal], [], [], 90)[0], text
+        text += os.read(terminal, 1 << 16)
+        if b"DO-CRIME" in text and working_until is None:
+            working_until = time.monotonic() + 3
+    os.close(terminal)
+    _, status = os.waitpid(pid, 0)
+    assert os.waitstatus_to_exitcode(status) == 130
+    check_products(out, [], ["im"])

@@ -119,3 +119,41 @@ def test_a_run_whose_progress_is_not_read_is_finished(bare, system, tmp_path, en
     assert (tmp_path / "run" / "im.fits").is_file()
     assert "Traceback" not in (tmp_path / "run" / "run.log").read_text()
     assert done.stdout
+
+
+@pytest.mark.parametrize("bare", ["buffered"], indirect=True)
+def test_a_loop_whose_streams_share_a_pipe_without_a_reader_keeps_its_data(bare, system, im, tmp_path):
+    """As ``escape loop ... 2>&1 | head -1``."""
+    nobody = without_reader()
+    words = ("loop", system, "--im", im, "--frames", 300, "--out", tmp_path / "run")
+    done = ended(words, bare, stdout=nobody, stderr=nobody)
+    os.close(nobody)
+    assert done.returncode == 1, "the results could not be printed"
+    assert (tmp_path / "run" / "loop.fits").is_file()
+    assert "Traceback" not in (tmp_path / "run" / "run.log").read_text()
+
+
+LOCALES = {
+    "ascii": {"PYTHONIOENCODING": "ascii"},
+    "latin": {"PYTHONIOENCODING": "latin-1"},
+    "unknown": {"LANG": "en_US.ISO-8859-1", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"},
+    "C": {"LANG": "C", "LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"},
+}
+
+
+@pytest.mark.parametrize("bare", ["buffered"], indirect=True)
+@pytest.mark.parametrize("locale", LOCALES)
+@pytest.mark.parametrize(
+    ("words", "code"),
+    [(("--help",), 0), (("doctor",), None), (("show", "n\N{LATIN SMALL LETTER O WITH DIAERESIS}"), 2)],
+    ids=["help", "doctor", "path"],
+)  # fmt: skip
+def test_every_locale(bare, locale, words, code):
+    environment = {**bare, **LOCALES[locale]}
+    done = subprocess.run(
+        [*ESCAPE, *map(os.fsencode, words)], capture_output=True, check=False, env=environment, timeout=60
+    )
+    assert done.returncode in ((0, 1) if code is None else (code,)), done.stderr
+    assert b"Traceback" not in done.stderr
+    assert b"defect of ESCAPE" not in done.stderr
+    (done.stdout + done.stderr).decode("latin-1" if locale == "latin" else "ascii")

@@ -14,7 +14,7 @@ from escape_hw.io.fits.loop import load_loop
 from escape_hw.io.fits.matrix import load_matrix
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT])
 @pytest.mark.parametrize("method", ["push-pull", "docrime", "escape"])
 def test_ctrl_c_in_a_calibration_saves_what_there_is(document, bench, tmp_path, method, number):
     bench.hook = lambda name: os.kill(os.getpid(), number)

@@ -144,12 +144,13 @@ def test_no_metrics_no_steps_no_config(tmp_path, small):
     assert product.config_text == ""
 
 
-def test_nan_in_the_data_survives(tmp_path, small):
+def test_nan_in_the_data_is_refused(tmp_path, small):
     data = small.matrix.data.copy()
     data[0, 0] = np.nan
     result = dataclasses.replace(small, matrix=dataclasses.replace(small.matrix, data=data))
-    product = load_matrix(save_matrix(tmp_path / "im.fits", result))
-    np.testing.assert_array_equal(product.matrix.data, data)
+    path = save_matrix(tmp_path / "im.fits", result)
+    with pytest.raises(ProductError, match="IM holds values that are not finite"):
+        load_matrix(path)
 
 
 def test_matrix_and_grid_must_belong_together(tmp_path, small):

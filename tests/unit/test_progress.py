@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import io
+import os
+import subprocess
 import sys
 
 import pytest
 from rich.console import Console
 
-from escape_hw.api.procedure import Progress
+from escape_hw.api.procedure import Progress, run
+from escape_hw.runtime.display.console import DisplayConsole
 from escape_hw.runtime.display.progress import ProgressView, format_time_left
 
 
@@ -92,3 +95,63 @@ def test_a_notebook_shows_one_output_without_widgets(monkeypatch: pytest.MonkeyP
     # In the end both stages are whole, and what was only waiting is gone.
     assert output.html[-1].count("value='100' max='100'") == 2
     assert "starting" not in output.html[-1]
+
+
+class Failing(io.StringIO):
+    """A stream on which nothing can be written after so many writes."""
+
+    def __init__(self, error: BaseException, after: int) -> None:
+        super().__init__()
+        self.error, self.left = error, after
+
+    def write(self, text: str) -> int:
+        self.left -= 1
+        if self.left < 0:
+            raise self.error
+        return super().write(text)
+
+
+@pytest.mark.parametrize("after", [0, 1, 3])
+@pytest.mark.parametrize("terminal", [True, False])
+@pytest.mark.parametrize(
+    "error",
+    [BrokenPipeError(32, "Broken pipe"), OSError(28, "No space left"), ValueError("closed file"),
+     UnicodeEncodeError("ascii", "é", 0, 1, "ordinal not in range"), SystemExit(1)],
+    ids=lambda error: type(error).__name__,
+)  # fmt: skip
+def test_a_failing_display_ends_no_run(error, terminal, after, monkeypatch):
+    stream = Failing(error, after)
+    monkeypatch.setattr(sys, "stderr", stream)
+
+    def procedure():
+        for done in (1, 50, 100):
+            yield Progress("DO-CRIME", done, 100, elapsed_s=done * 20.0)
+        return "result"
+
+    console = DisplayConsole()
+    console._force_terminal = terminal
+    with ProgressView(console) as view:
+        assert run(procedure(), observers=(view,)) == "result"
+
+
+def test_a_pipe_without_a_reader_ends_no_program_and_leaves_its_output(tmp_path):
+    program = """
+from escape_hw.api.procedure import Progress, run
+from escape_hw.runtime.display.console import DisplayConsole
+from escape_hw.runtime.display.progress import ProgressView
+
+def procedure():
+    for done in range(1, 100):
+        yield Progress(f"stage {done}", done, 100, elapsed_s=1.0)
+    return "result"
+
+with ProgressView(DisplayConsole()) as view:
+    print(run(procedure(), observers=(view,)), flush=True)
+"""
+    reading, writing = os.pipe()
+    os.close(reading)
+    done = subprocess.run(
+        [sys.executable, "-c", program], stdout=subprocess.PIPE, stderr=writing, timeout=60, check=False
+    )
+    os.close(writing)
+    assert (done.returncode, done.stdout) == (0, b"result\n")

@@ -205,3 +205,17 @@ def test_the_guard_does_not_rely_on_the_librarys_range_check(asdk, mode) -> None
         report = dm.send(np.full(97, 3.0) * np.where(np.arange(97) % 2, 1, -1))
         assert report.guard.clipped == 97
         assert np.array_equal(asdk.shape(97), report.sent)
+
+
+@pytest.mark.parametrize("max_slew", [None, 0.2])
+def test_a_shape_without_acknowledgement_is_flattened(asdk, max_slew) -> None:
+    overrides = () if max_slew is None else (f"devices.dm.limits.max_slew={max_slew}",)
+    with make("alpao", *overrides) as dm:
+        dm.flatten()
+        asdk.script("asdkSend 2 unacknowledged")
+        with pytest.raises(DeviceError, match="error 0x10D"):
+            dm.send(np.full(97, 0.15))
+        assert asdk.shape(97).any(), "the mirror moved"
+        dm.flatten()
+        assert not asdk.shape(97).any()
+    assert not asdk.violations

@@ -241,7 +241,8 @@ def test_pulses_come_where_the_trigger_says(servo):
 
 def test_replies_have_the_manuals_form(servo):
     assert servo.say("POS?") == "1=0.000000000e+00 \n2=0.000000000e+00\n"
-    assert servo.say("SAI?") == "1 \n2 \n3\n"
+    assert servo.say("SAI?") == "1 \n2\n"
+    assert servo.say("SAI? ALL") == "1 \n2 \n3\n"
     assert servo.say("CST? 3") == "3=NOSTAGE\n"
     assert servo.say("spa? 1 0x0E000200") == "1 0xE000200=5.000000000e-05\n"
     assert servo.error("WAV 1 X PNT 1 2 5 6") == 0
@@ -302,3 +303,10 @@ def test_fault_words_of_version_0_1_0_are_accepted(capsys):
         "deprecated: 'lose' is now 'drop_command'; the old word will be removed"
     )
     assert gcs_syntax.ERRORS[73] == "wave generator active"
+
+
+def test_every_axis_that_is_named_answers(servo):
+    """As PIPython, which asks every axis that SAI? names."""
+    names = servo.say("SAI?").split()
+    assert servo.say(f"POS? {' '.join(names)}").count("=") == len(names)
+    assert servo.say("ERR?") == "0\n"

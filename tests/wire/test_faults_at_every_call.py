@@ -32,7 +32,7 @@ def use_camera(camera: Any) -> None:
 USES: dict[str, Callable[[Any], None]] = {"alpao": use_mirror, "ximea": use_camera, "aravis": use_camera}
 #: What may happen at a call, for each library as far as it means something there.
 ACTIONS = {
-    "alpao": ("error 0x104", "error 0x10D", "ignore", "timeout 1", "reset", "unplug"),
+    "alpao": ("error 0x104", "error 0x10D", "unacknowledged 0x10D", "ignore", "timeout 1", "reset", "unplug"),
     "ximea": (
         "error 13", "ignore", "timeout 1", "reset", "short 20", "short 40", "unplug 1", "unplug 55",
         "unplug 56",

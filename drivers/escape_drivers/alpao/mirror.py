@@ -131,12 +131,11 @@ class AlpaoMirror(DeformableMirror):
             sequence = self._validate_sequence(patterns, repeats)
             self._stop_playing()
             library, handle = self._require_connected()
-            self._playing = True
+            # The mirror's shape is unknown from here on, also if the call fails: the next flatten() sends.
+            self._playing, self._shape_known = True, False
             pointer = c_void_p(sequence.ctypes.data)
             library.call("asdkSendPattern", handle, pointer, len(sequence), repeats)
-            # The mirror's shape is unknown from here on: the next flatten() always sends.
             self._guard_when_open().reset(sequence[-1])
-            self._shape_known = False
 
     def stop_pattern(self) -> None:
         """Stop a sequence; the mirror keeps the shape it has. Does nothing when none runs."""

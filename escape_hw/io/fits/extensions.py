@@ -92,6 +92,7 @@ def unpack_grid(path: Path, hdus: fits.HDUList) -> SensorGeometry:
     references = fits_file.read_array(path, hdus, "GRID", np.float32)
     if references.shape != (int(valid.sum()), 2):
         raise ProductError(f"{path}: GRID has shape {references.shape}, VALID marks {int(valid.sum())}")
+    fits_file.require_values(path, "GRID", references, -1e6, 1e6)
     # Products of early versions have no card SENSOR; they are Shack-Hartmann sensors.
     kind = str(header.get("SENSOR", SubApertureGrid.kind))
     if kind not in _CARDS:

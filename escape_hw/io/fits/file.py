@@ -19,6 +19,7 @@ from astropy.io import fits
 from astropy.utils.exceptions import AstropyWarning
 from numpy.typing import NDArray
 
+from escape_hw.bounded_files import max_product_bytes, read_bounded
 from escape_hw.errors import ProductError
 from escape_hw.io.provenance import Provenance, format_utc, get_git_state, get_software_version
 from escape_hw.io.storage import write_atomic
@@ -190,7 +191,7 @@ def read(path: Path, kind: str | None = None) -> tuple[fits.HDUList, str]:
         message names the file and the check.
     """
     try:
-        content = path.read_bytes()
+        content = read_bounded(path, max_product_bytes())
     except OSError as error:
         raise ProductError(f"{path}: cannot be read ({error.strerror or error})") from error
     _check_bytes(path, content)
@@ -231,6 +232,9 @@ def _check_hdus(path: Path, hdus: fits.HDUList, kind: str | None) -> None:
     header = hdus[0].header
     if "KIND" not in header or "SCHEMA" not in header or "NHDU" not in header:
         raise ProductError(f"{path}: a FITS file, but not an ESCAPE product (no KIND, SCHEMA or NHDU)")
+    for key, kind_of_value in (("KIND", str), ("SCHEMA", int), ("NHDU", int)):
+        if type(header[key]) is not kind_of_value:
+            raise ProductError(f"{path}: its card {key} is {header[key]!r}; it is no ESCAPE product")
     if header["SCHEMA"] > SCHEMA:
         raise ProductError(
             f"{path}: written by a newer version (schema {header['SCHEMA']}, this one reads up to {SCHEMA}); "
@@ -259,6 +263,12 @@ def read_array(path: Path, hdus: fits.HDUList, name: str, dtype: Any) -> NDArray
     if not isinstance(data, np.ndarray):
         raise ProductError(f"{path}: extension {name} holds no image")
     return np.ascontiguousarray(data).astype(np.dtype(dtype).newbyteorder("="))
+
+
+def require_values(path: Path, name: str, values: NDArray[Any], low: float, high: float) -> None:
+    """Raise :class:`ProductError` unless every value is finite and within ``low`` .. ``high``."""
+    if values.size and not (float(values.min()) >= low and float(values.max()) <= high):
+        raise ProductError(f"{path}: {name} holds values that are not finite, or not in {low:g} .. {high:g}")
 
 
 def read_text(path: Path, hdus: fits.HDUList, name: str) -> str:
@@ -310,7 +320,10 @@ class Product(Generic[R]):
         hdus, sha256 = read(path, kind)
         header = header_dict(hdus)
         try:
-            result = unpack(path, hdus, header)
-        except (KeyError, ValueError, TypeError, IndexError) as error:
+            result, config = unpack(path, hdus, header), read_text(path, hdus, "CONFIG")
+        except ProductError:
+            raise
+        except Exception as error:
+            # Whatever a crafted file makes of the parts, it is the file that is wrong.
             raise ProductError(f"{path}: its parts do not fit together ({error})") from error
-        return cls(path, result, read_text(path, hdus, "CONFIG"), header, sha256)
+        return cls(path, result, config, header, sha256)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.results import CalibrationResult, RegistrationEstimate
 from escape_hw.api.sensor import SensorGeometry
+from escape_hw.bounded_files import max_product_bytes, read_bounded
 from escape_hw.errors import IncompatibleProduct, ProductError
 from escape_hw.io.fits import extensions
 from escape_hw.io.fits import file as fits_file
@@ -20,6 +22,8 @@ from escape_hw.io.fits.file import Product
 from escape_hw.io.provenance import Provenance
 
 KIND_MATRIX = "IM"
+#: Largest magnitude of a value in a matrix or basis, in its own unit; anything beyond is damage.
+_LARGEST = 1e12
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -155,7 +159,7 @@ def _unpack_matrix(
     path: Path, hdus: astropy_fits.HDUList, header: dict[str, Any], prefix: str
 ) -> InteractionMatrix:
     cards = fits_file.require_extension(path, hdus, f"{prefix}IM").header
-    return InteractionMatrix(
+    matrix = InteractionMatrix(
         data=fits_file.read_array(path, hdus, f"{prefix}IM", np.float32),
         sigma=fits_file.read_array(path, hdus, f"{prefix}SIGMA", np.float32),
         m2c=fits_file.read_array(path, hdus, "M2C", np.float64),
@@ -166,10 +170,17 @@ def _unpack_matrix(
         metrics=extensions.unpack_metrics(path, hdus, f"{prefix}METRICS"),
         slope_unit=str(cards["BUNIT"]),
     )
+    for name, values, low in (("IM", matrix.data, -_LARGEST), ("SIGMA", matrix.sigma, 0.0)):
+        fits_file.require_values(path, f"{prefix}{name}", values, low, _LARGEST)
+    fits_file.require_values(path, "M2C", matrix.m2c, -_LARGEST, _LARGEST)
+    return matrix
 
 
 def _unpack(path: Path, hdus: astropy_fits.HDUList, header: dict[str, Any]) -> CalibrationResult:
     run = extensions.unpack_metrics(path, hdus, "RUN")
+    for card in ("FRAMES", "LOST"):
+        if type(header[card]) is not int or header[card] < 0:
+            raise ProductError(f"{path}: its card {card} is {header[card]!r}; a number of frames is needed")
     frame = fits_file.read_array(path, hdus, "FRAME", np.float32) if "FRAME" in hdus else None
     return CalibrationResult(
         matrix=_unpack_matrix(path, hdus, header, ""),
@@ -222,10 +233,14 @@ def load_basis(path: Path | str) -> NDArray[np.float64]:
     """
     path = Path(path)
     try:
-        with astropy_fits.open(path, memmap=False) as hdus:
+        content = io.BytesIO(read_bounded(path, max_product_bytes()))
+        with astropy_fits.open(content, memmap=False) as hdus:
             if "KIND" not in hdus[0].header:
                 return _read_matrix_image(path, hdus)
-    except OSError as error:
+    except ProductError:
+        raise
+    except Exception as error:
+        # Astropy raises errors of many kinds for damaged files.
         raise ProductError(f"{path}: cannot be read as FITS ({error})") from error
     return load_matrix(path).matrix.m2c
 

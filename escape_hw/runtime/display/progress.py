@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
+import logging
 import time
+from collections.abc import Callable
 from types import TracebackType
 from typing import Self
 
@@ -17,8 +20,14 @@ from escape_hw.runtime.display.notebook import NotebookProgress
 _LINE_PERIOD_S = 10.0
 
 
+log = logging.getLogger(__name__)
+
+
 class ProgressView:
-    """Shows a procedure's progress: bars on a terminal or in a notebook, lines elsewhere."""
+    """Shows a procedure's progress: bars on a terminal or in a notebook, lines elsewhere.
+
+    A display that fails, whatever the reason, is logged and ends; the procedure continues.
+    """
 
     def __init__(self, console: Console, quiet: bool = False) -> None:
         self._console, self._quiet = console, quiet
@@ -30,8 +39,10 @@ class ProgressView:
 
     def __enter__(self) -> Self:
         """Open the bars."""
-        if self._quiet:
-            return self
+        self._attempt(self._open)
+        return self
+
+    def _open(self) -> None:
         if self._console.is_jupyter:
             self._notebook = NotebookProgress()
         elif self._console.is_terminal:
@@ -46,22 +57,39 @@ class ProgressView:
                 console=self._console,
             )
             self._bars.start()
-        return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         """Close the bars."""
-        if self._notebook is not None and error is None:
-            self._notebook.finish()
-        if self._bars is not None:
-            self._bars.stop()
-            self._bars = None
+        self._attempt(lambda: self._close(error is None))
 
     def __call__(self, progress: Progress) -> None:
         """Show one progress."""
+        self._attempt(lambda: self._show(progress))
+
+    def _attempt(self, action: Callable[[], object]) -> None:
         if self._quiet:
             return
+        try:
+            action()
+        except (Exception, SystemExit) as error:
+            # Rich ends the program when the reader of a pipe is gone.
+            self._quiet = True
+            log.info("progress is no longer shown: %s: %s", type(error).__name__, error)
+            bars, self._bars = self._bars, None
+            if bars is not None:
+                with contextlib.suppress(Exception, SystemExit):
+                    bars.stop()
+
+    def _close(self, succeeded: bool) -> None:
+        if self._notebook is not None and succeeded:
+            self._notebook.finish()
+        bars, self._bars = self._bars, None
+        if bars is not None:
+            bars.stop()
+
+    def _show(self, progress: Progress) -> None:
         if self._notebook is not None:
             self._notebook.draw(progress.stage, progress.done, progress.total, _format_line(progress))
         elif self._bars is not None:

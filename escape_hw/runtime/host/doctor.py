@@ -241,8 +241,11 @@ def _alpao_address(section: DeviceConfig) -> str:
 
 def _check_disk_space(folder: Path) -> Iterator[Finding]:
     place = folder
-    while not place.exists():
+    while not os.path.exists(place):
         place = place.parent
+    if place != folder and not os.access(place, os.W_OK | os.X_OK):
+        remedy = "set HOME or XDG_DATA_HOME to a folder that you may write, or choose one with --out"
+        yield Finding("data folder", "error", f"{folder} cannot be made in {place}", remedy)
     free = shutil.disk_usage(place).free / 1e9
     remedy = "delete files, or choose another folder with --out"
     yield _judge("free space", free >= FREE_GB, f"{free:.1f} GB in {place}", remedy)

@@ -81,11 +81,11 @@ class System(Bench):
             procedure = procedure.on_bench(self)
         if not progress:
             return run_procedure(procedure, observers=observers, abort=abort)
-        from rich.console import Console
 
+        from escape_hw.runtime.display.console import DisplayConsole
         from escape_hw.runtime.display.progress import ProgressView
 
-        with ProgressView(Console(stderr=True)) as view:
+        with ProgressView(DisplayConsole()) as view:
             return run_procedure(procedure, observers=(*observers, view), abort=abort)
 
     @procedure_method(ModelPsfProcedure)

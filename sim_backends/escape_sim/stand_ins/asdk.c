@@ -140,6 +140,12 @@ static int call_rejected(asdkDM *dm, struct si_function *function, struct si_rul
     }
 }
 
+/* The end of a call that was executed: its acknowledgement arrives, or is lost. */
+static COMPL_STAT end_call(const struct si_rule *rule) {
+    if (rule->action != SI_UNACKNOWLEDGED) return SUCCESS;
+    return push_error(rule->argument ? (UInt)rule->argument : 0x10D, "acknowledge time-out");
+}
+
 #define BEGIN(title, ...)                                                                                     \
     static struct si_function f = {.name = title};                                                            \
     struct si_rule rule;                                                                                      \
@@ -238,7 +244,8 @@ EXPORT COMPL_STAT asdkSend(asdkDM *dm, const Scalar *v) {
     }
     int range_result = check_range("asdkSend", v, n_act);
     if (range_result == 0) return push_error(0x11, "value out of range");
-    return range_result < 0 ? SUCCESS : transfer(dm, v);
+    if (range_result > 0 && transfer(dm, v) != SUCCESS) return FAILURE;
+    return end_call(&rule);
 }
 
 EXPORT COMPL_STAT asdkSendPattern(asdkDM *dm, const Scalar *p, UInt n_pattern, UInt n_repeat) {
@@ -257,13 +264,13 @@ EXPORT COMPL_STAT asdkSendPattern(asdkDM *dm, const Scalar *p, UInt n_pattern, U
     dm->playing = n_repeat ? (int)n_repeat : -1;
     /* A millisecond each, the order of this mirror's settling time. */
     dm->played_until = si_now_ns() + (int64_t)n_pattern * n_repeat * 1000000;
-    return outcome;
+    return outcome == SUCCESS ? end_call(&rule) : outcome;
 }
 
 EXPORT COMPL_STAT asdkStop(asdkDM *dm) {
     BEGIN("asdkStop", "%s", "");
     dm->playing = 0;
-    return SUCCESS;
+    return end_call(&rule);
 }
 
 EXPORT COMPL_STAT asdkReset(asdkDM *dm) {
@@ -274,7 +281,7 @@ EXPORT COMPL_STAT asdkReset(asdkDM *dm) {
     if (dm->linked && transfer(dm, zeros) != SUCCESS) return FAILURE;
     memset(applied_shape, 0, sizeof applied_shape);
     dm->not_at_zero = 0;
-    return SUCCESS;
+    return end_call(&rule);
 }
 
 EXPORT COMPL_STAT asdkGet(asdkDM *dm, const char *name, Scalar *out) {

@@ -36,10 +36,11 @@
 #define SI_TIMEOUT_S 60 /* a simulated bench compiles its optics on the first frame */
 
 enum si_action {
-    SI_NONE, SI_ERROR, SI_IGNORE, SI_TIMEOUT, SI_RESET, SI_SHORT, SI_UNPLUG, SI_INVALID_HANDLE, SI_DROP
+    SI_NONE, SI_ERROR, SI_IGNORE, SI_TIMEOUT, SI_RESET, SI_SHORT, SI_UNPLUG, SI_INVALID_HANDLE, SI_DROP,
+    SI_UNACKNOWLEDGED
 };
 static const char *const si_actions[] = {"", "error", "ignore", "timeout", "reset",
-                                         "short", "unplug", "invalid_handle", "drop"};
+                                         "short", "unplug", "invalid_handle", "drop", "unacknowledged"};
 /* Words of version 0.1.0 and their present names. */
 static const char *const si_renamed[][2] = {
     {"lose", "drop"}, {"half", "invalid_handle"}, {"peeks", "errors_stay"}, {"dim", "attenuation"},

@@ -14,6 +14,7 @@ from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.pyramid import PyramidPupils
 from escape_hw.api.results import CalibrationResult
 from escape_hw.api.sensor import SensorGeometry, SubApertureGrid, require_kind
+from escape_hw.bounded_files import MAX_TEXT_BYTES, read_bounded
 from escape_hw.errors import IncompatibleProduct, ProductError
 from escape_hw.io.documents import registration_document
 from escape_hw.io.interchange.optional_packages import import_optional
@@ -76,10 +77,10 @@ class PyrtcConfig:
         yaml = import_optional("yaml", "Reading pyRTC's configuration")
         path = Path(path)
         try:
-            document = yaml.safe_load(path.read_text(encoding="utf-8"))
+            document = yaml.safe_load(read_bounded(path, MAX_TEXT_BYTES).decode("utf-8"))
         except OSError as error:
             raise ProductError(f"{path}: cannot be read ({error.strerror or error})") from error
-        except (yaml.YAMLError, UnicodeDecodeError) as error:
+        except (yaml.YAMLError, ValueError, RecursionError) as error:
             raise ProductError(f"{path}: not YAML ({' '.join(str(error).split())})") from error
         sections = document if isinstance(document, dict) else {}
         found = {name: sections.get(name) or {} for name in ("slopes", "loop", "wfs", "wfc")}

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import io
 import json
-import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from escape_hw.errors import ConfigError, IncompatibleProduct, ProductError
+from escape_hw.io.arrays import load_arrays
 from escape_hw.io.documents import to_plain_values
 from escape_hw.io.provenance import get_software_version
 from escape_hw.io.storage import write_atomic
@@ -62,16 +62,13 @@ def read_file(path: Path | str, kind: str | None = None) -> PyrtcFile:
     """
     path = Path(path)
     try:
-        # From memory: numpy leaves the file of a damaged archive open.
-        loaded = np.load(io.BytesIO(path.read_bytes()), allow_pickle=False)
-        if isinstance(loaded, np.ndarray):
-            return PyrtcFile(path, loaded, None)
-        with loaded as archive:
-            parts = {name: archive[name] for name in archive.files}
+        parts = load_arrays(path)
     except OSError as error:
         raise ProductError(f"{path}: cannot be read ({error.strerror or error})") from error
-    except (ValueError, EOFError, zipfile.BadZipFile, KeyError) as error:
+    except ValueError as error:
         raise ProductError(f"{path}: damaged, or not a calibration file of pyRTC ({error})") from error
+    if isinstance(parts, np.ndarray):
+        return PyrtcFile(path, parts, None)
     return _with_record(path, parts, kind)
 
 
@@ -85,7 +82,7 @@ def _with_record(path: Path, parts: dict[str, NDArray[Any]], kind: str | None) -
     try:
         record = json.loads(str(parts[_RECORD][()]))
         number = int(record.get("format", 0))
-    except (ValueError, TypeError, AttributeError) as error:
+    except (ValueError, TypeError, AttributeError, RecursionError) as error:
         raise ProductError(f"{path}: its record is damaged ({error})") from error
     if number > FORMAT:
         raise ProductError(

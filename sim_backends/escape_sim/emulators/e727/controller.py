@@ -60,7 +60,7 @@ class E727Controller:
         self._handlers: dict[str, Handler] = {
             **motion.queries(), **waves.queries(),
             "*IDN?": lambda _: IDENTITY.format(serial=self.settings.serial) + "\n",
-            "CSV?": lambda _: "2.0\n", "SAI?": lambda _: format_lines(["1", "2", "3"]),
+            "CSV?": lambda _: "2.0\n", "SAI?": self._axis_names,
             "HLP?": self._help, "HPA?": self._parameter_list, "VER?": lambda _: "FW_DSP: 14.11.01.05\n",
             "CST?": self._stages, "IFC?": lambda _: "RSBAUD=115200\n",
             "CCL": self._set_level, "CCL?": lambda _: f"{self.state.level}\n",
@@ -158,6 +158,12 @@ class E727Controller:
         return format_lines(
             [f"0x{key:X}= 0 1 FLOAT parameter" for key in sorted({key for _, key in self.state.parameters})]
         )
+
+    def _axis_names(self, args: Sequence[str]) -> str:
+        """Names of the axes that answer queries; ``ALL`` adds the one without a stage."""
+        if args not in ([], ["ALL"]):
+            raise GcsCommandError(56)
+        return format_lines([*self.state.axes, *(["3"] if args else [])])
 
     def _stages(self, args: Sequence[str]) -> str:
         names = {"1": "S-330.2SL", "2": "S-330.2SL", "3": "NOSTAGE"}

@@ -1,0 +1,57 @@
+"""Home directories that cannot be read or written, or are no directories, for a user without privileges."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from running import ESCAPE
+
+NOBODY = 65534
+
+
+@pytest.fixture(scope="module")
+def homes(tmp_path_factory) -> dict[str, str]:
+    unreadable = tmp_path_factory.mktemp("home") / "secret"
+    unreadable.mkdir(mode=0o000)
+    return {"unreadable": str(unreadable), "missing": "/nonexistent", "no folder": "/dev/null"}
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="users of Linux")
+@pytest.mark.parametrize("home", ["unreadable", "missing", "no folder"])
+@pytest.mark.parametrize(
+    "words", ["systems", "show IM", "doctor", "keys make", "keys list", "calibrate", "docrime"]
+)
+def test_a_home_that_cannot_be_used(homes, im, system, tmp_path, home, words):
+    if os.getuid() == 0 and shutil.which("setpriv") is None:
+        pytest.skip("needs setpriv to become another user")
+    command = {
+        "show IM": ("show", "im.fits"),
+        "calibrate": ("calibrate", "small.toml", "--method", "docrime", "--frames", 100),
+        "docrime": ("calibrate", "small.toml", "--method", "docrime", "--frames", 100, "--out", "run"),
+    }.get(words, tuple(words.split()))
+    place = Path("/tmp" if os.getuid() == 0 else tmp_path) / f"escape-home-test-{os.getpid()}"
+    place.mkdir(exist_ok=True)
+    try:
+        place.chmod(0o777)
+        shutil.copy(im, place / "im.fits")
+        shutil.copy(system, place / "small.toml")
+        kept = {name: value for name, value in os.environ.items() if not name.startswith("XDG_")}
+        other_user = ("setpriv", f"--reuid={NOBODY}", f"--regid={NOBODY}", "--clear-groups")
+        done = subprocess.run(
+            [*(other_user if os.getuid() == 0 else ()), *ESCAPE, *map(str, command)],
+            capture_output=True, text=True, check=False, timeout=120, cwd=place,
+            env={**kept, "HOME": homes[home]},
+        )  # fmt: skip
+    finally:
+        shutil.rmtree(place)
+    assert "Traceback" not in done.stderr
+    assert "defect of ESCAPE" not in done.stderr
+    works = words in ("systems", "show IM", "docrime")
+    # Keys of nobody: an unreadable folder is an error, a missing one holds none.
+    expected = {"doctor": (1, 2), "keys list": (0, 2)}.get(words, (0,) if works else (2,))
+    assert done.returncode in expected, done.stderr
