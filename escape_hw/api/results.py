@@ -15,8 +15,10 @@ from escape_hw.api.representation import line_html, short_repr, table_html
 from escape_hw.api.sensor import SensorGeometry
 from escape_hw.deprecation import renamed_members
 
-#: Width of the broad pedestal of the influence functions, relative to their own width.
-PEDESTAL = 1.7
+#: Widths of the components of the influence functions' radial profile, relative to the nominal one. A sum of
+#: nominal functions of these widths approximates the profiles of real mirrors; for Gaussians see
+#: ``docs/theory``.
+PROFILE_WIDTHS = (0.35, 0.6, 1.7, 2.9)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -32,14 +34,14 @@ class ActuatorCorrections:
         Relative gain of every actuator beyond the common one, and its standard error ``(n_act,)``.
     width
         Relative width of every influence function beyond the common one ``(n_act,)``.
-    pedestal
-        Share of the broad pedestal in all influence functions.
+    profile
+        Share of each component of the radial profile in all influence functions ``(n_components,)``.
     """
 
     gain: NDArray[np.float64]
     gain_sigma: NDArray[np.float64]
     width: NDArray[np.float64]
-    pedestal: float
+    profile: NDArray[np.float64]
     __repr__ = short_repr
 
 

@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from escape_hw.api.registration import Registration
-from escape_hw.api.results import PEDESTAL
 from escape_hw.api.synthetic_model import DifferentiableModel, SyntheticModel
 
 #: Half steps of the central differences: registration in its units, relative width of the influence
@@ -77,20 +76,21 @@ def zonal_jacobian(
     return _central_differences(model.zonal_matrix, registration, width)
 
 
-def pedestal_jacobian(
+def component_jacobian(
     model: SyntheticModel,
     registration: Registration,
-    width: float = 1.0,
+    width: float,
+    relative_width: float,
     m2c: NDArray[np.float64] | None = None,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Slopes of the broad pedestal of the influence functions, and their derivatives.
+    """Slopes of a component of the influence functions' radial profile, and their derivatives.
 
     Parameters
     ----------
     model, registration
         As for :func:`modal_matrix`.
-    width
-        Scale of the influence functions' width; that of the pedestal is a fixed multiple of it.
+    width, relative_width
+        Scale of the influence functions' width, and the width of the component relative to it.
     m2c
         Modes ``(n_act, n_modes)``; single actuators by default.
 
@@ -101,10 +101,10 @@ def pedestal_jacobian(
         By the five parameters of the registration, in their units, and by ``width``.
     """
     if m2c is None:
-        broad, derivatives = zonal_jacobian(model, registration, PEDESTAL * width)
+        matrix, derivatives = zonal_jacobian(model, registration, relative_width * width)
     else:
-        broad, derivatives = modal_jacobian(model, registration, m2c, PEDESTAL * width)
-    return broad, np.concatenate([derivatives[:5], PEDESTAL * derivatives[5:]])
+        matrix, derivatives = modal_jacobian(model, registration, m2c, relative_width * width)
+    return matrix, np.concatenate([derivatives[:5], relative_width * derivatives[5:]])
 
 
 def _central_differences(

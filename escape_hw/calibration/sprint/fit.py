@@ -17,7 +17,7 @@ from escape_hw.api.concurrency import limit_to_one_thread
 from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.procedure import Procedure
 from escape_hw.api.registration import PARAMETERS, Registration
-from escape_hw.api.results import Estimate, RegistrationEstimate
+from escape_hw.api.results import PROFILE_WIDTHS, Estimate, RegistrationEstimate
 from escape_hw.api.synthetic_model import SyntheticModel
 from escape_hw.calibration.modes.derivatives import modal_matrix
 from escape_hw.calibration.sprint.coarse_search import MIN_EXPLAINED_FRACTION
@@ -53,7 +53,7 @@ from escape_hw.errors import CalibrationError, ConfigError, IncompatibleProduct
 T = TypeVar("T")
 
 #: The common parameters, in their order; shares of the model's variants follow.
-_PARAMETER_NAMES = ("gain", *PARAMETERS, "width", "pedestal")
+_PARAMETER_NAMES = ("gain", *PARAMETERS, "width", *(f"profile_{k}" for k in range(1, 1 + len(PROFILE_WIDTHS))))
 #: Remaining step, relative to the stated errors, below which the descent counts as converged.
 _NEGLIGIBLE_STEP = 0.05
 #: Optional attributes of a model in version 0.1.0 -> present names.

@@ -13,19 +13,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from escape_hw.api.registration import Registration
-from escape_hw.api.results import PEDESTAL, ActuatorCorrections
+from escape_hw.api.results import PROFILE_WIDTHS, ActuatorCorrections
 from escape_hw.api.synthetic_model import HasGainTrend, SyntheticModel
-from escape_hw.calibration.modes.derivatives import modal_matrix, pedestal_jacobian, zonal_jacobian
+from escape_hw.calibration.modes.derivatives import component_jacobian, modal_matrix, zonal_jacobian
 from escape_hw.calibration.sprint.extra_parameters import ExtraParameterModel, FittedExtraParameter
 from escape_hw.calibration.sprint.normal_equations import NormalEquations, Priors, normal_equations
 from escape_hw.calibration.sprint.weighted_matrix import WeightedMatrix
 
 #: Indices of the common parameters among the unknowns; those of the registration are 1 to 5.
-GAIN, WIDTH, SHAPE = 0, 6, 7
+GAIN, WIDTH, PROFILE = 0, 6, 7
+#: Number of components of the radial profile beside the nominal one, and index of the first variant.
+N_PROFILE = len(PROFILE_WIDTHS)
+VARIANTS = PROFILE + N_PROFILE
 #: Share of a variant below which its derivatives by the registration are taken to be the model's own.
 _SMALL_SHARE = 0.25
-#: Share of the pedestal below which its derivatives by the registration are neglected.
-_SMALL_PEDESTAL = 0.05
+#: Share of a component of the profile below which its derivatives by the registration are neglected.
+_SMALL_COMPONENT = 0.02
 #: Relative gain after a step above which the step of the shares is scaled to keep gain times share linear.
 _MIN_GAIN_RATIO = 0.05
 #: Groups of random effects, in the order of the unknowns ...
@@ -54,7 +57,7 @@ class MixedEffectsState:
     gain: float
     alpha: NDArray[np.float64]
     width: float
-    shape: float
+    profile: NDArray[np.float64]
     variant: NDArray[np.float64]
     sampling: NDArray[np.float64]
     trend: NDArray[np.float64]
@@ -69,7 +72,7 @@ class _ZonalMatrices:
 
     jacobian: NDArray[np.float64]
     by_width: NDArray[np.float64]
-    by_shape: NDArray[np.float64]
+    by_profile: list[NDArray[np.float64]]
     variants: list[NDArray[np.float64]]
     total: NDArray[np.float64]
 
@@ -107,7 +110,7 @@ class MixedEffectsProblem:
         self.n_lines = int(self.lines.max()) + 1
         self.trends = slope_trends(model, weighted.valid)
         self.precision = np.concatenate([
-            np.zeros(6), [priors.width**-2, priors.shape**-2], scatters**-2,
+            np.zeros(6), [priors.width**-2], np.full(N_PROFILE, priors.profile**-2), scatters**-2,
             np.full(self.n_lines, priors.sampling**-2), np.ones(self.trends.shape[1]),
             np.full(model.n_act, priors.noise_inflation * priors.actuator_gain**-2),
             np.full(model.n_act, priors.actuator_width**-2),
@@ -121,7 +124,7 @@ class MixedEffectsProblem:
         model = self.weighted.weigh(modal_matrix(self.model, registration, self.modes))
         gain = float(np.vdot(model, self.weighted.data) / np.vdot(model, model))
         return MixedEffectsState(
-            gain, registration.to_array(), self.priors.mean_width, 0.0, self._mean_variant.copy(),
+            gain, registration.to_array(), self.priors.mean_width, np.zeros(N_PROFILE), self._mean_variant.copy(),
             np.zeros(self.n_lines), np.zeros(self.trends.shape[1]), zeros, zeros.copy(), np.zeros(n_slopes),
         )  # fmt: skip
 
@@ -135,7 +138,7 @@ class MixedEffectsProblem:
 
     def offset(self, state: MixedEffectsState) -> NDArray[np.float64]:
         """Distance of a state from the prior means, in the order of the unknowns."""
-        common = [*np.zeros(6), state.width - self.priors.mean_width, state.shape]
+        common = [*np.zeros(6), state.width - self.priors.mean_width, *state.profile]
         effects = state.sampling, state.trend, state.actuator_gain, state.actuator_width, state.slope_gain
         return np.concatenate([common, state.variant - self._mean_variant, *effects])
 
@@ -148,7 +151,7 @@ class MixedEffectsProblem:
         """The extra parameters at a state."""
         first = len(self.variants)
         return tuple(
-            FittedExtraParameter(one, SHAPE + 1 + first + k, float(state.variant[first + k]))
+            FittedExtraParameter(one, VARIANTS + first + k, float(state.variant[first + k]))
             for k, one in enumerate(self.extras)
         )
 
@@ -166,20 +169,27 @@ class MixedEffectsProblem:
             changed, changes = (weigh(part) for part in zonal_jacobian(variant, registration, w))
             variants.append(changed - zonal_matrix)
             jacobian = jacobian + share * (changes - base)
-        if abs(state.shape) < _SMALL_PEDESTAL:
-            broad = weigh(self.model.zonal_matrix(registration, w * PEDESTAL))
-        else:
-            broad, changes = (weigh(part) for part in pedestal_jacobian(self.model, registration, w))
-            jacobian = jacobian + state.shape * (changes - base)
-        by_width, by_shape = jacobian[5] * w, broad - zonal_matrix
+        by_profile = []
+        for relative_width, share in zip(PROFILE_WIDTHS, state.profile, strict=True):
+            if abs(share) < _SMALL_COMPONENT:
+                component = weigh(self.model.zonal_matrix(registration, w * relative_width))
+            else:
+                component, changes = (
+                    weigh(part) for part in component_jacobian(self.model, registration, w, relative_width)
+                )
+                jacobian = jacobian + share * (changes - base)
+            by_profile.append(component - zonal_matrix)
+        by_width = jacobian[5] * w
         first = len(self.variants)
         for extra, share in zip(self.extras, state.variant[first:], strict=False):
             variants.append(weigh(extra.matrix_change(registration, w, float(share))))
         variants += [zonal_matrix @ command_curve for command_curve in self.command_curves]
-        total = zonal_matrix + state.shape * by_shape + state.actuator_width * by_width
+        total = zonal_matrix + state.actuator_width * by_width
+        for share, difference in zip(state.profile, by_profile, strict=True):
+            total = total + share * difference
         for share, difference in zip(state.variant, variants, strict=True):
             total = total + share * difference
-        return _ZonalMatrices(jacobian, by_width, by_shape, variants, total)
+        return _ZonalMatrices(jacobian, by_width, by_profile, variants, total)
 
     def matrix(self, state: MixedEffectsState, m2c: NDArray[np.float64]) -> NDArray[np.float64]:
         """Slopes per unit of modes ``m2c (n_act, n)`` at a state, random effects included."""
@@ -195,7 +205,7 @@ class MixedEffectsProblem:
             return np.asarray(rows * (zonal @ scaled_modes))
 
         unit = modal(z.total)
-        parts = (*z.jacobian, z.by_shape, *z.variants)
+        parts = (*z.jacobian, *z.by_profile, *z.variants)
         common = np.stack([unit, *(state.gain * modal(part) for part in parts)])
         # A sampling position acts as a shift shared by the lenslets of a column (x) or a row (y).
         half = unit.shape[0] // 2
@@ -229,7 +239,7 @@ class MixedEffectsProblem:
         to step.
         """
         variance = system.posterior_variance()
-        head, n_act = SHAPE + 1 + self.n_variants, self.model.n_act
+        head, n_act = VARIANTS + self.n_variants, self.model.n_act
         counts = (self.n_lines, self.trends.shape[1], n_act, n_act, self.weighted.data.shape[0])
         lines, _, gains, widths, slopes = np.split(variance[head:], np.cumsum(counts)[:-1])
         scatter, usual = {}, Priors()
@@ -261,20 +271,20 @@ class MixedEffectsProblem:
             max(rms, self.weighted.noise_level(system.residual)),
         )  # fmt: skip
         gains, widths = groups
-        return ActuatorCorrections(value[gains], sigma[gains], value[widths], state.shape)
+        return ActuatorCorrections(value[gains], sigma[gains], value[widths], state.profile)
 
     def move(self, state: MixedEffectsState, step: NDArray[np.floating]) -> MixedEffectsState:
         """The state after a step, in the order of the unknowns."""
         n_act = self.model.n_act
         counts = self.n_variants, self.n_lines, self.trends.shape[1], n_act, n_act
-        variant, sampling, trend, gains, widths, slopes = np.split(step[8:], np.cumsum(counts))
+        variant, sampling, trend, gains, widths, slopes = np.split(step[VARIANTS:], np.cumsum(counts))
         # The matrix is linear in gain times share, so the step is exact in that product.
         gain = state.gain + step[GAIN]
         gain_ratio = state.gain / gain if gain > _MIN_GAIN_RATIO * state.gain else 1.0
         return MixedEffectsState(
             gain, state.alpha + step[1:6],
             float(np.clip(state.width + step[WIDTH], -0.5, 1.0)),
-            float(np.clip(state.shape + gain_ratio * step[SHAPE], -0.5, 0.5)),
+            state.profile + gain_ratio * step[PROFILE:VARIANTS],
             state.variant + gain_ratio * variant, state.sampling + sampling, state.trend + trend,
             state.actuator_gain + gains, state.actuator_width + widths, state.slope_gain + slopes,
         )  # fmt: skip

@@ -29,8 +29,8 @@ class Priors:
         Position within its lenslet at which a slope samples the wavefront, in % of a sub-aperture; common
         to the x slopes of a column and to the y slopes of a row, which have the same alignment with the
         pixels.
-    width, shape
-        Common width of the influence functions, and the share of a broad pedestal in them.
+    width, profile
+        Common width of the influence functions, and the share of each component of their radial profile.
     mean_width
         Prior mean of the relative width beyond nominal: zero, or the value of an earlier fit.
     extras
@@ -46,7 +46,7 @@ class Priors:
     actuator_width: float = 0.05
     slope_gain: float = 0.1
     width: float = 0.2
-    shape: float = 0.2
+    profile: float = 0.3
     sampling: float = 0.5
     mean_width: float = 0.0
     extras: tuple[tuple[float, float], ...] = ()

@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.pyramid import PyramidPupils
 from escape_hw.api.registration import Registration
-from escape_hw.api.results import PEDESTAL, CalibrationResult, RegistrationEstimate
+from escape_hw.api.results import PROFILE_WIDTHS, CalibrationResult, RegistrationEstimate
 from escape_hw.api.sensor import SensorGeometry
 from escape_hw.api.synthetic_model import SyntheticModel
 from escape_hw.bench import Bench
 from escape_hw.calibration.acquisition.frames import build_interaction_matrix
-from escape_hw.calibration.modes.derivatives import modal_jacobian, modal_matrix, pedestal_jacobian
+from escape_hw.calibration.modes.derivatives import component_jacobian, modal_jacobian, modal_matrix
 from escape_hw.calibration.sprint.extra_parameters import build_fitted_extra_parameters
 
 
@@ -71,10 +71,12 @@ def compute_fitted_jacobian(
     unit, derivatives = modal_jacobian(model, registration, scaled_modes, width)
     actuator_variance = np.zeros_like(unit)
     if corrections is not None:
-        scaled_value, single = corrections.pedestal, model.zonal_matrix(registration, width)
-        broad = pedestal_jacobian(model, registration, width, scaled_modes)[1]
-        derivatives = derivatives + scaled_value * (broad - derivatives)
-        single = single + scaled_value * (model.zonal_matrix(registration, width * PEDESTAL) - single)
+        base, nominal = derivatives, model.zonal_matrix(registration, width)
+        single = nominal
+        for relative_width, share in zip(PROFILE_WIDTHS, corrections.profile, strict=True):
+            component = component_jacobian(model, registration, width, relative_width, scaled_modes)[1]
+            derivatives = derivatives + share * (component - base)
+            single = single + share * (model.zonal_matrix(registration, width * relative_width) - nominal)
         actuator_variance = np.square(single) @ np.square(corrections.gain_sigma[:, None] * m2c)
     return _add_corrections(unit, model, registration, estimate, scaled_modes), derivatives, actuator_variance
 
@@ -99,12 +101,15 @@ def _add_corrections(
         unit = unit + scaled_value * (one.matrix_change(registration, width, scaled_value) @ scaled_modes)
     if corrections is None:
         return unit
-    scaled_value, wider = corrections.pedestal, corrections.width[:, None] * scaled_modes
-    broad = modal_matrix(model, registration, scaled_modes, width * PEDESTAL)
-    pedestal_change = broad - modal_matrix(model, registration, scaled_modes, width)
+    wider = corrections.width[:, None] * scaled_modes
+    nominal = modal_matrix(model, registration, scaled_modes, width)
     own = modal_jacobian(model, registration, wider, width)[1][5]
-    width_change = own + scaled_value * (pedestal_jacobian(model, registration, width, wider)[1][5] - own)
-    return np.asarray(unit + scaled_value * pedestal_change + width * width_change)
+    change = width * own
+    for relative_width, share in zip(PROFILE_WIDTHS, corrections.profile, strict=True):
+        component = modal_matrix(model, registration, scaled_modes, width * relative_width)
+        by_width = component_jacobian(model, registration, width, relative_width, wider)[1][5]
+        change = change + share * (component - nominal + width * (by_width - own))
+    return np.asarray(unit + change)
 
 
 def compute_pseudo_synthetic_matrix(
