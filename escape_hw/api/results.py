@@ -36,12 +36,15 @@ class ActuatorCorrections:
         Relative width of every influence function beyond the common one ``(n_act,)``.
     profile
         Share of each component of the radial profile in all influence functions ``(n_components,)``.
+    position
+        Position of every actuator along x and y beyond the nominal one, in % of a sub-aperture ``(2, n_act)``.
     """
 
     gain: NDArray[np.float64]
     gain_sigma: NDArray[np.float64]
     width: NDArray[np.float64]
     profile: NDArray[np.float64]
+    position: NDArray[np.float64]
     __repr__ = short_repr
 
 

@@ -53,7 +53,7 @@ from escape_hw.errors import CalibrationError, ConfigError, IncompatibleProduct
 T = TypeVar("T")
 
 #: The common parameters, in their order; shares of the model's variants follow.
-_PARAMETER_NAMES = ("gain", *PARAMETERS, "width", *(f"profile_{k}" for k in range(1, 1 + len(PROFILE_WIDTHS))))
+_PARAMETER_NAMES = ("gain", *PARAMETERS, "width", *(f"profile_{k}" for k in range(1, 1 + len(PROFILE_WIDTHS))), *(f"edge_{k}" for k in range(1, 14)))
 #: Remaining step, relative to the stated errors, below which the descent counts as converged.
 _NEGLIGIBLE_STEP = 0.05
 #: Optional attributes of a model in version 0.1.0 -> present names.

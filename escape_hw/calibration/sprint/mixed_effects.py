@@ -24,16 +24,25 @@ from escape_hw.calibration.sprint.weighted_matrix import WeightedMatrix
 GAIN, WIDTH, PROFILE = 0, 6, 7
 #: Number of components of the radial profile beside the nominal one, and index of the first variant.
 N_PROFILE = len(PROFILE_WIDTHS)
-VARIANTS = PROFILE + N_PROFILE
+#: Edge actuators: common relative gain and width beyond those of the others, components of their radial profile,
+#: and of its outward asymmetry.
+EDGE = PROFILE + N_PROFILE
+N_EDGE = 2 + N_PROFILE + 1 + N_PROFILE
+#: Four-fold terms of the influence functions: distances of their lobes in pitches, and widths.
+FOURFOLD_LOBES = ((0.7, 0.6), (1.4, 1.0))
+FOURFOLD = EDGE + N_EDGE
+N_FOURFOLD = len(FOURFOLD_LOBES)
+VARIANTS = FOURFOLD + N_FOURFOLD
 #: Share of a variant below which its derivatives by the registration are taken to be the model's own.
 _SMALL_SHARE = 0.25
 #: Share of a component of the profile below which its derivatives by the registration are neglected.
 _SMALL_COMPONENT = 0.02
 #: Relative gain after a step above which the step of the shares is scaled to keep gain times share linear.
 _MIN_GAIN_RATIO = 0.05
-#: Groups of random effects, in the order of the unknowns ...
-_EFFECTS = ("sampling", "actuator_gain", "actuator_width", "slope_gain")
-#: ... and limits of their estimated scatter relative to the default priors.
+#: Effects of single actuators, in the order of the unknowns, and the priors of their scatter.
+_ACTUATOR_PRIORS = ("actuator_gain", "actuator_width", "actuator_position", "actuator_position")
+N_ACTUATOR_EFFECTS = len(_ACTUATOR_PRIORS)
+#: Limits of the estimated scatter relative to the default priors.
 _MIN_PRIOR_RATIO, _MAX_PRIOR_RATIO = 0.05, 1.0
 #: Iterations of the empirical-Bayes fixed point; later ones change the scatter by less than a percent.
 _ITERATIONS = 20
@@ -58,12 +67,18 @@ class MixedEffectsState:
     alpha: NDArray[np.float64]
     width: float
     profile: NDArray[np.float64]
+    edge: NDArray[np.float64]
+    fourfold: NDArray[np.float64]
     variant: NDArray[np.float64]
     sampling: NDArray[np.float64]
     trend: NDArray[np.float64]
-    actuator_gain: NDArray[np.float64]
-    actuator_width: NDArray[np.float64]
+    actuator: NDArray[np.float64]
     slope_gain: NDArray[np.float64]
+
+    @property
+    def actuator_gain(self) -> NDArray[np.float64]:
+        """Relative gain of every actuator beyond the common one ``(n_act,)``."""
+        return np.asarray(self.actuator[0])
 
 
 @dataclass(slots=True, eq=False)
@@ -73,6 +88,8 @@ class _ZonalMatrices:
     jacobian: NDArray[np.float64]
     by_width: NDArray[np.float64]
     by_profile: list[NDArray[np.float64]]
+    by_edge: list[NDArray[np.float64]]
+    by_fourfold: list[NDArray[np.float64]]
     variants: list[NDArray[np.float64]]
     total: NDArray[np.float64]
 
@@ -108,24 +125,31 @@ class MixedEffectsProblem:
         # The x slopes of a column of sub-apertures share a sampling position, and the y slopes of a row.
         self.lines = np.unique(np.concatenate([cols, weighted.valid.shape[1] + rows]), return_inverse=True)[1]
         self.n_lines = int(self.lines.max()) + 1
+        self.edge, self.outward, self.pitch = edge_actuators(model)
         self.trends = slope_trends(model, weighted.valid)
         self.precision = np.concatenate([
-            np.zeros(6), [priors.width**-2], np.full(N_PROFILE, priors.profile**-2), scatters**-2,
+            np.zeros(6), [priors.width**-2], np.full(N_PROFILE, priors.profile**-2),
+            np.repeat([priors.edge_gain, priors.edge_width, priors.edge_profile, priors.edge_asymmetry], [1, 1, N_PROFILE, 1 + N_PROFILE]) ** -2.0,
+            np.full(N_FOURFOLD, priors.fourfold**-2), scatters**-2,
             np.full(self.n_lines, priors.sampling**-2), np.ones(self.trends.shape[1]),
-            np.full(model.n_act, priors.noise_inflation * priors.actuator_gain**-2),
-            np.full(model.n_act, priors.actuator_width**-2),
+            *(np.full(model.n_act, self._actuator_precision(name)) for name in _ACTUATOR_PRIORS),
             np.full(weighted.data.shape[0], priors.slope_gain**-2),
         ])  # fmt: skip
+
+    def _actuator_precision(self, name: str) -> float:
+        """Prior precision of an effect of the actuators."""
+        return float(self.priors.noise_inflation * getattr(self.priors, name) ** -2)
 
     def initial_state(self, registration: Registration) -> MixedEffectsState:
         """A registration, the gain that fits best there, and the prior means."""
         n_act, n_slopes = self.model.n_act, self.weighted.data.shape[0]
-        zeros = np.zeros(n_act)
         model = self.weighted.weigh(modal_matrix(self.model, registration, self.modes))
         gain = float(np.vdot(model, self.weighted.data) / np.vdot(model, model))
         return MixedEffectsState(
-            gain, registration.to_array(), self.priors.mean_width, np.zeros(N_PROFILE), self._mean_variant.copy(),
-            np.zeros(self.n_lines), np.zeros(self.trends.shape[1]), zeros, zeros.copy(), np.zeros(n_slopes),
+            gain, registration.to_array(), self.priors.mean_width, np.zeros(N_PROFILE), np.zeros(N_EDGE), np.zeros(N_FOURFOLD),
+            self._mean_variant.copy(),
+            np.zeros(self.n_lines), np.zeros(self.trends.shape[1]), np.zeros((N_ACTUATOR_EFFECTS, n_act)),
+            np.zeros(n_slopes),
         )  # fmt: skip
 
     def _prior_moments(self) -> NDArray[np.float64]:
@@ -138,8 +162,8 @@ class MixedEffectsProblem:
 
     def offset(self, state: MixedEffectsState) -> NDArray[np.float64]:
         """Distance of a state from the prior means, in the order of the unknowns."""
-        common = [*np.zeros(6), state.width - self.priors.mean_width, *state.profile]
-        effects = state.sampling, state.trend, state.actuator_gain, state.actuator_width, state.slope_gain
+        common = [*np.zeros(6), state.width - self.priors.mean_width, *state.profile, *state.edge, *state.fourfold]
+        effects = state.sampling, state.trend, state.actuator.ravel(), state.slope_gain
         return np.concatenate([common, state.variant - self._mean_variant, *effects])
 
     @property
@@ -170,26 +194,32 @@ class MixedEffectsProblem:
             variants.append(changed - zonal_matrix)
             jacobian = jacobian + share * (changes - base)
         by_profile = []
+        dipoles = [self._outward_derivative(base)]
         for relative_width, share in zip(PROFILE_WIDTHS, state.profile, strict=True):
-            if abs(share) < _SMALL_COMPONENT:
-                component = weigh(self.model.zonal_matrix(registration, w * relative_width))
-            else:
-                component, changes = (
-                    weigh(part) for part in component_jacobian(self.model, registration, w, relative_width)
-                )
-                jacobian = jacobian + share * (changes - base)
+            component, changes = (
+                weigh(part) for part in component_jacobian(self.model, registration, w, relative_width)
+            )
+            jacobian = jacobian + share * (changes - base)
+            dipoles.append(relative_width**2 * self._outward_derivative(changes))
             by_profile.append(component - zonal_matrix)
         by_width = jacobian[5] * w
         first = len(self.variants)
         for extra, share in zip(self.extras, state.variant[first:], strict=False):
             variants.append(weigh(extra.matrix_change(registration, w, float(share))))
         variants += [zonal_matrix @ command_curve for command_curve in self.command_curves]
-        total = zonal_matrix + state.actuator_width * by_width
+        _, width, along_x, along_y = state.actuator
+        total = zonal_matrix + width * by_width + along_x * jacobian[0] + along_y * jacobian[1]
         for share, difference in zip(state.profile, by_profile, strict=True):
+            total = total + share * difference
+        by_edge = [self.edge * part for part in (total, by_width, *by_profile, *dipoles)]
+        by_fourfold = [weigh(part) for part in self._fourfold(registration, w)]
+        for share, difference in zip(state.fourfold, by_fourfold, strict=True):
+            total = total + share * difference
+        for share, difference in zip(state.edge, by_edge, strict=True):
             total = total + share * difference
         for share, difference in zip(state.variant, variants, strict=True):
             total = total + share * difference
-        return _ZonalMatrices(jacobian, by_width, by_profile, variants, total)
+        return _ZonalMatrices(jacobian, by_width, by_profile, by_edge, by_fourfold, variants, total)
 
     def matrix(self, state: MixedEffectsState, m2c: NDArray[np.float64]) -> NDArray[np.float64]:
         """Slopes per unit of modes ``m2c (n_act, n)`` at a state, random effects included."""
@@ -205,17 +235,46 @@ class MixedEffectsProblem:
             return np.asarray(rows * (zonal @ scaled_modes))
 
         unit = modal(z.total)
-        parts = (*z.jacobian, *z.by_profile, *z.variants)
+        parts = (*z.jacobian, *z.by_profile, *z.by_edge, *z.by_fourfold, *z.variants)
         common = np.stack([unit, *(state.gain * modal(part) for part in parts)])
         # A sampling position acts as a shift shared by the lenslets of a column (x) or a row (y).
         half = unit.shape[0] // 2
         sampling_derivative = np.concatenate([common[1, :half], common[2, half:]])
         model = state.gain * unit + state.sampling[self.lines, None] * sampling_derivative
         return normal_equations(
-            common, state.gain * rows * z.total, state.gain * rows * z.by_width * actuator_factor, self.modes,
+            common, state.gain * rows * self._actuator_derivatives(z, actuator_factor), self.modes,
             state.gain * (z.total @ scaled_modes), self.weighted.data - model, self.precision,
             self.offset(state), sampling_derivative, self.lines, self.trends,
         )  # fmt: skip
+
+    def _outward_derivative(self, jacobian: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Derivative of the zonal matrix by outward positions of the actuators ``(n_slopes, n_act)``."""
+        return np.asarray(jacobian[0] * self.outward[0] + jacobian[1] * self.outward[1])
+
+    def _fourfold(self, registration: Registration, width: float) -> list[NDArray[np.float64]]:
+        """Four-fold terms of the zonal matrix ``(n_slopes, n_act)``: lobes along the axes less those between."""
+        if not self.pitch:
+            return [np.zeros((self.weighted.data.shape[0], self.model.n_act))] * N_FOURFOLD
+        terms, affine = [], registration.affine(self.model.sub_aperture_m)[0]
+        for distance, relative_width in FOURFOLD_LOBES:
+            total = 0.0
+            for number in range(8):
+                angle = number * np.pi / 4
+                shift = affine @ (self.pitch * distance * np.array([np.cos(angle), np.sin(angle)]))
+                lobe = replace(
+                    registration, shift_x=registration.shift_x + shift[0], shift_y=registration.shift_y + shift[1]
+                )
+                total = total + (-1.0) ** number * self.model.zonal_matrix(lobe, width * relative_width)
+            terms.append(np.asarray(total))
+        return terms
+
+    def _actuator_derivatives(
+        self, z: _ZonalMatrices, actuator_factor: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Weighted derivatives by the effects of the actuators ``(n_effects, n_slopes, n_act)``."""
+        return np.stack(
+            [z.total, z.by_width * actuator_factor, z.jacobian[0] * actuator_factor, z.jacobian[1] * actuator_factor]
+        )
 
     def _slope_gains(self, state: MixedEffectsState) -> NDArray[np.float64]:
         """Gain of every slope relative to the common one ``(n_slopes,)``."""
@@ -240,14 +299,21 @@ class MixedEffectsProblem:
         """
         variance = system.posterior_variance()
         head, n_act = VARIANTS + self.n_variants, self.model.n_act
-        counts = (self.n_lines, self.trends.shape[1], n_act, n_act, self.weighted.data.shape[0])
-        lines, _, gains, widths, slopes = np.split(variance[head:], np.cumsum(counts)[:-1])
-        scatter, usual = {}, Priors()
-        parts = lines, self.priors.noise_inflation * gains, widths, slopes
-        for name, part in zip(_EFFECTS, parts, strict=True):
-            least = _MIN_PRIOR_RATIO * getattr(usual, name)
-            mean_square = float(np.mean(np.square(getattr(state, name)) + part))
-            scatter[name] = max(float(np.sqrt(mean_square)), least)
+        counts = (self.n_lines, self.trends.shape[1], N_ACTUATOR_EFFECTS * n_act)
+        lines, _, actuators, slopes = np.split(variance[head:], np.cumsum(counts))
+        gains, widths, *positions = self.priors.noise_inflation * actuators.reshape(-1, n_act)
+        squares = {
+            "sampling": np.square(state.sampling) + lines,
+            "actuator_gain": np.square(state.actuator[0]) + gains,
+            "actuator_width": np.square(state.actuator[1]) + widths,
+            "actuator_position": np.square(state.actuator[2:]) + np.array(positions),
+            "slope_gain": np.square(state.slope_gain) + slopes,
+        }
+        usual = Priors()
+        scatter = {
+            name: max(float(np.sqrt(np.mean(square))), _MIN_PRIOR_RATIO * getattr(usual, name))
+            for name, square in squares.items()
+        }
         if self.trends.shape[1]:
             scatter["noise_inflation"] = system.estimate_noise_inflation()
         n_effective_parameters = float(np.sum(1 - variance * self.precision))
@@ -258,11 +324,12 @@ class MixedEffectsProblem:
         # The slope gains, eliminated first, come last.
         inner = len(system.schur_complement)
         n_act = self.model.n_act
-        groups = slice(inner - 2 * n_act, inner - n_act), slice(inner - n_act, inner)
+        first = inner - N_ACTUATOR_EFFECTS * n_act
+        groups = [slice(first + k * n_act, first + (k + 1) * n_act) for k in range(N_ACTUATOR_EFFECTS)]
         usual = Priors()
         bounds = [
-            (_MIN_PRIOR_RATIO * each, _MAX_PRIOR_RATIO * each)
-            for each in (usual.actuator_gain, usual.actuator_width)
+            (_MIN_PRIOR_RATIO * getattr(usual, name), _MAX_PRIOR_RATIO * getattr(usual, name))
+            for name in _ACTUATOR_PRIORS
         ]
         # A misfit of the model enlarges the noise that the effects are compared with.
         rms = float(np.sqrt(np.mean(np.square(system.residual))))
@@ -270,24 +337,40 @@ class MixedEffectsProblem:
             system.schur_complement, self.offset(state)[:inner], self.precision[:inner], groups, bounds,
             max(rms, self.weighted.noise_level(system.residual)),
         )  # fmt: skip
-        gains, widths = groups
-        return ActuatorCorrections(value[gains], sigma[gains], value[widths], state.profile)
+        gains, widths, along_x, along_y = groups
+        positions = np.stack([value[along_x], value[along_y]])
+        return ActuatorCorrections(value[gains], sigma[gains], value[widths], state.profile, positions)
 
     def move(self, state: MixedEffectsState, step: NDArray[np.floating]) -> MixedEffectsState:
         """The state after a step, in the order of the unknowns."""
         n_act = self.model.n_act
-        counts = self.n_variants, self.n_lines, self.trends.shape[1], n_act, n_act
-        variant, sampling, trend, gains, widths, slopes = np.split(step[VARIANTS:], np.cumsum(counts))
+        counts = self.n_variants, self.n_lines, self.trends.shape[1], N_ACTUATOR_EFFECTS * n_act
+        variant, sampling, trend, actuators, slopes = np.split(step[VARIANTS:], np.cumsum(counts))
         # The matrix is linear in gain times share, so the step is exact in that product.
         gain = state.gain + step[GAIN]
         gain_ratio = state.gain / gain if gain > _MIN_GAIN_RATIO * state.gain else 1.0
         return MixedEffectsState(
             gain, state.alpha + step[1:6],
             float(np.clip(state.width + step[WIDTH], -0.5, 1.0)),
-            state.profile + gain_ratio * step[PROFILE:VARIANTS],
+            state.profile + gain_ratio * step[PROFILE:EDGE], state.edge + step[EDGE:FOURFOLD],
+            state.fourfold + gain_ratio * step[FOURFOLD:VARIANTS],
             state.variant + gain_ratio * variant, state.sampling + sampling, state.trend + trend,
-            state.actuator_gain + gains, state.actuator_width + widths, state.slope_gain + slopes,
+            state.actuator + actuators.reshape(-1, n_act), state.slope_gain + slopes,
         )  # fmt: skip
+
+
+def edge_actuators(model: SyntheticModel) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+    """One for edge actuators, else zero ``(n_act,)``, outward ``(2, n_act)``, and pitch in % of a sub-aperture."""
+    if not hasattr(model, "actuator_positions_m"):
+        return np.zeros(model.n_act), np.zeros((2, model.n_act)), 0.0
+    positions = model.actuator_positions_m
+    centred = positions - positions.mean(axis=0)
+    distance = np.linalg.norm(positions[:, None] - positions, axis=2)
+    nearest = np.sort(distance, axis=1)[:, 1]
+    neighbours = (distance < 1.3 * np.median(nearest)).sum(axis=1)
+    edge = (neighbours < np.median(neighbours)).astype(float)
+    pitch = float(100 / model.sub_aperture_m * np.median(nearest))
+    return edge, 0.55 * pitch * (centred / np.maximum(np.linalg.norm(centred, axis=1), 1e-12)[:, None]).T, pitch
 
 
 def slope_trends(model: SyntheticModel, valid: NDArray[np.bool_]) -> NDArray[np.float64]:
