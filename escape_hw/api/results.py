@@ -15,12 +15,6 @@ from escape_hw.api.representation import line_html, short_repr, table_html
 from escape_hw.api.sensor import SensorGeometry
 from escape_hw.deprecation import renamed_members
 
-#: Widths of the components of the influence functions' radial profile, relative to the nominal one. A sum of
-#: nominal functions of these widths approximates the profiles of real mirrors; for Gaussians see
-#: ``docs/theory``.
-PROFILE_WIDTHS = (0.35, 0.6, 1.7, 2.9)
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class ActuatorCorrections:
     """Fitted differences between the actuators and the nominal ones.
@@ -34,8 +28,9 @@ class ActuatorCorrections:
         Relative gain of every actuator beyond the common one, and its standard error ``(n_act,)``.
     width
         Relative width of every influence function beyond the common one ``(n_act,)``.
-    profile
-        Share of each component of the radial profile in all influence functions ``(n_components,)``.
+    shape
+        Coefficients of the common shape of the influence functions
+        (:class:`~escape_hw.calibration.sprint.influence_shape.InfluenceShape`).
     position
         Position of every actuator along x and y beyond the nominal one, in % of a sub-aperture ``(2, n_act)``.
     """
@@ -43,7 +38,7 @@ class ActuatorCorrections:
     gain: NDArray[np.float64]
     gain_sigma: NDArray[np.float64]
     width: NDArray[np.float64]
-    profile: NDArray[np.float64]
+    shape: NDArray[np.float64]
     position: NDArray[np.float64]
     __repr__ = short_repr
 

@@ -76,37 +76,6 @@ def zonal_jacobian(
     return _central_differences(model.zonal_matrix, registration, width)
 
 
-def component_jacobian(
-    model: SyntheticModel,
-    registration: Registration,
-    width: float,
-    relative_width: float,
-    m2c: NDArray[np.float64] | None = None,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Slopes of a component of the influence functions' radial profile, and their derivatives.
-
-    Parameters
-    ----------
-    model, registration
-        As for :func:`modal_matrix`.
-    width, relative_width
-        Scale of the influence functions' width, and the width of the component relative to it.
-    m2c
-        Modes ``(n_act, n_modes)``; single actuators by default.
-
-    Returns
-    -------
-    matrix : ndarray, ``(n_slopes, n_modes)``
-    derivatives : ndarray, ``(6, n_slopes, n_modes)``
-        By the five parameters of the registration, in their units, and by ``width``.
-    """
-    if m2c is None:
-        matrix, derivatives = zonal_jacobian(model, registration, relative_width * width)
-    else:
-        matrix, derivatives = modal_jacobian(model, registration, m2c, relative_width * width)
-    return matrix, np.concatenate([derivatives[:5], relative_width * derivatives[5:]])
-
-
 def _central_differences(
     build_matrix: Callable[[Registration, float], NDArray[np.float64]],
     registration: Registration,

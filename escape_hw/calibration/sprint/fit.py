@@ -17,11 +17,11 @@ from escape_hw.api.concurrency import limit_to_one_thread
 from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.procedure import Procedure
 from escape_hw.api.registration import PARAMETERS, Registration
-from escape_hw.api.results import PROFILE_WIDTHS, Estimate, RegistrationEstimate
+from escape_hw.api.results import Estimate, RegistrationEstimate
 from escape_hw.api.synthetic_model import SyntheticModel
 from escape_hw.calibration.modes.derivatives import modal_matrix
 from escape_hw.calibration.sprint.coarse_search import MIN_EXPLAINED_FRACTION
-from escape_hw.calibration.sprint.covariance import MODEL_ERROR_FLOOR, sandwich_covariance, systematic_error
+from escape_hw.calibration.sprint.covariance import sandwich_covariance, systematic_error
 from escape_hw.calibration.sprint.diagnostics import check_orientation, describe_degeneracies
 from escape_hw.calibration.sprint.extra_parameters import build_extra_parameters
 from escape_hw.calibration.sprint.mixed_effects import GAIN, WIDTH, PriorEstimate
@@ -53,7 +53,7 @@ from escape_hw.errors import CalibrationError, ConfigError, IncompatibleProduct
 T = TypeVar("T")
 
 #: The common parameters, in their order; shares of the model's variants follow.
-_PARAMETER_NAMES = ("gain", *PARAMETERS, "width", *(f"profile_{k}" for k in range(1, 1 + len(PROFILE_WIDTHS))), *(f"edge_{k}" for k in range(1, 14)))
+_PARAMETER_NAMES = ("gain", *PARAMETERS, "width")
 #: Remaining step, relative to the stated errors, below which the descent counts as converged.
 _NEGLIGIBLE_STEP = 0.05
 #: Optional attributes of a model in version 0.1.0 -> present names.
@@ -125,7 +125,7 @@ def sprint(
     max_iterations: int = 25,
     covariance: NDArray[np.float64] | None = None,
     priors: Priors | None = None,
-    update_priors: bool = False,
+    update_priors: bool = True,
     coarse_search: bool = True,
     extra_parameters: Sequence[ExtraParameter] = (),
     actuator_model: ActuatorModel = "fitted",
@@ -165,7 +165,7 @@ def sprint(
     priors
         Prior scatter of the random effects.
     update_priors
-        Estimate that scatter from the data and solve again with it; useful with few frames.
+        Estimate that scatter from the data and solve again with it.
     coarse_search
         Search from far away first, low modes before high ones (:mod:`~.coarse_search`). Without it the
         descent starts at ``start`` with all modes.
@@ -221,7 +221,7 @@ def fit_registration(
     max_iterations: int = 25,
     covariance: NDArray[np.float64] | None = None,
     priors: Priors | None = None,
-    update_priors: bool = False,
+    update_priors: bool = True,
     coarse_search: bool = True,
     extra_parameters: Sequence[ExtraParameter] = (),
     actuator_model: ActuatorModel = "fitted",
@@ -388,7 +388,7 @@ def _build_estimate(
         warnings,
         notes,
         extras={
-            one.model.name: one.to_estimate(sigma, np.hypot(MODEL_ERROR_FLOOR, model_sigma))
+            one.model.name: one.to_estimate(sigma, model_sigma)
             for one in solution.extras
         },
     )

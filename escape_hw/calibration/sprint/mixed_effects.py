@@ -13,39 +13,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from escape_hw.api.registration import Registration
-from escape_hw.api.results import PROFILE_WIDTHS, ActuatorCorrections
+from escape_hw.api.results import ActuatorCorrections
 from escape_hw.api.synthetic_model import HasGainTrend, SyntheticModel
-from escape_hw.calibration.modes.derivatives import component_jacobian, modal_matrix, zonal_jacobian
+from escape_hw.calibration.modes.derivatives import modal_matrix, zonal_jacobian
 from escape_hw.calibration.sprint.extra_parameters import ExtraParameterModel, FittedExtraParameter
+from escape_hw.calibration.sprint.influence_shape import InfluenceShape, ShapedMatrix
 from escape_hw.calibration.sprint.normal_equations import NormalEquations, Priors, normal_equations
 from escape_hw.calibration.sprint.weighted_matrix import WeightedMatrix
 
 #: Indices of the common parameters among the unknowns; those of the registration are 1 to 5.
-GAIN, WIDTH, PROFILE = 0, 6, 7
-#: Number of components of the radial profile beside the nominal one, and index of the first variant.
-N_PROFILE = len(PROFILE_WIDTHS)
-#: Edge actuators: common relative gain and width beyond those of the others, components of their radial profile,
-#: and of its outward asymmetry.
-EDGE = PROFILE + N_PROFILE
-N_EDGE = 2 + N_PROFILE + 1 + N_PROFILE
-#: Four-fold terms of the influence functions: distances of their lobes in pitches, and widths.
-FOURFOLD_LOBES = ((0.7, 0.6), (1.4, 1.0))
-FOURFOLD = EDGE + N_EDGE
-N_FOURFOLD = len(FOURFOLD_LOBES)
-VARIANTS = FOURFOLD + N_FOURFOLD
+GAIN, WIDTH, SHAPE = 0, 6, 7
 #: Share of a variant below which its derivatives by the registration are taken to be the model's own.
 _SMALL_SHARE = 0.25
-#: Share of a component of the profile below which its derivatives by the registration are neglected.
-_SMALL_COMPONENT = 0.02
 #: Relative gain after a step above which the step of the shares is scaled to keep gain times share linear.
 _MIN_GAIN_RATIO = 0.05
 #: Effects of single actuators, in the order of the unknowns, and the priors of their scatter.
 _ACTUATOR_PRIORS = ("actuator_gain", "actuator_width", "actuator_position", "actuator_position")
 N_ACTUATOR_EFFECTS = len(_ACTUATOR_PRIORS)
 #: Limits of the estimated scatter relative to the default priors.
-_MIN_PRIOR_RATIO, _MAX_PRIOR_RATIO = 0.05, 1.0
-#: Iterations of the empirical-Bayes fixed point; later ones change the scatter by less than a percent.
-_ITERATIONS = 20
+_MIN_PRIOR_RATIO, _MAX_PRIOR_RATIO = 0.05, 3.0
+#: Iterations of the empirical-Bayes fixed point, and relative change of all scatters that ends them.
+_ITERATIONS, _NEGLIGIBLE_CHANGE = 20, 0.02
 #: Zero effects that are added to the count of each group: the scatter of a few effects may be chance, and
 #: omitting a real effect costs less than inventing one.
 _PSEUDO_COUNT = 2.0
@@ -66,9 +54,7 @@ class MixedEffectsState:
     gain: float
     alpha: NDArray[np.float64]
     width: float
-    profile: NDArray[np.float64]
-    edge: NDArray[np.float64]
-    fourfold: NDArray[np.float64]
+    shape: NDArray[np.float64]
     variant: NDArray[np.float64]
     sampling: NDArray[np.float64]
     trend: NDArray[np.float64]
@@ -83,13 +69,11 @@ class MixedEffectsState:
 
 @dataclass(slots=True, eq=False)
 class _ZonalMatrices:
-    """Zonal matrices at a state, in standard errors: derivatives, variants, and their sum."""
+    """Zonal matrices at a state, in standard errors: derivatives, terms of the shape, variants, and their sum."""
 
     jacobian: NDArray[np.float64]
     by_width: NDArray[np.float64]
-    by_profile: list[NDArray[np.float64]]
-    by_edge: list[NDArray[np.float64]]
-    by_fourfold: list[NDArray[np.float64]]
+    terms: list[NDArray[np.float64]]
     variants: list[NDArray[np.float64]]
     total: NDArray[np.float64]
 
@@ -125,12 +109,10 @@ class MixedEffectsProblem:
         # The x slopes of a column of sub-apertures share a sampling position, and the y slopes of a row.
         self.lines = np.unique(np.concatenate([cols, weighted.valid.shape[1] + rows]), return_inverse=True)[1]
         self.n_lines = int(self.lines.max()) + 1
-        self.edge, self.outward, self.pitch = edge_actuators(model)
+        self.shape = InfluenceShape(model)
         self.trends = slope_trends(model, weighted.valid)
         self.precision = np.concatenate([
-            np.zeros(6), [priors.width**-2], np.full(N_PROFILE, priors.profile**-2),
-            np.repeat([priors.edge_gain, priors.edge_width, priors.edge_profile, priors.edge_asymmetry], [1, 1, N_PROFILE, 1 + N_PROFILE]) ** -2.0,
-            np.full(N_FOURFOLD, priors.fourfold**-2), scatters**-2,
+            np.zeros(6), [priors.width**-2], self.shape.prior_sigma**-2.0, scatters**-2,
             np.full(self.n_lines, priors.sampling**-2), np.ones(self.trends.shape[1]),
             *(np.full(model.n_act, self._actuator_precision(name)) for name in _ACTUATOR_PRIORS),
             np.full(weighted.data.shape[0], priors.slope_gain**-2),
@@ -146,7 +128,7 @@ class MixedEffectsProblem:
         model = self.weighted.weigh(modal_matrix(self.model, registration, self.modes))
         gain = float(np.vdot(model, self.weighted.data) / np.vdot(model, model))
         return MixedEffectsState(
-            gain, registration.to_array(), self.priors.mean_width, np.zeros(N_PROFILE), np.zeros(N_EDGE), np.zeros(N_FOURFOLD),
+            gain, registration.to_array(), self.priors.mean_width, np.zeros(self.shape.n_terms),
             self._mean_variant.copy(),
             np.zeros(self.n_lines), np.zeros(self.trends.shape[1]), np.zeros((N_ACTUATOR_EFFECTS, n_act)),
             np.zeros(n_slopes),
@@ -162,9 +144,14 @@ class MixedEffectsProblem:
 
     def offset(self, state: MixedEffectsState) -> NDArray[np.float64]:
         """Distance of a state from the prior means, in the order of the unknowns."""
-        common = [*np.zeros(6), state.width - self.priors.mean_width, *state.profile, *state.edge, *state.fourfold]
+        common = [*np.zeros(6), state.width - self.priors.mean_width, *state.shape]
         effects = state.sampling, state.trend, state.actuator.ravel(), state.slope_gain
         return np.concatenate([common, state.variant - self._mean_variant, *effects])
+
+    @property
+    def first_variant(self) -> int:
+        """Index of the first variant among the unknowns."""
+        return SHAPE + self.shape.n_terms
 
     @property
     def n_variants(self) -> int:
@@ -175,51 +162,35 @@ class MixedEffectsProblem:
         """The extra parameters at a state."""
         first = len(self.variants)
         return tuple(
-            FittedExtraParameter(one, VARIANTS + first + k, float(state.variant[first + k]))
+            FittedExtraParameter(one, self.first_variant + first + k, float(state.variant[first + k]))
             for k, one in enumerate(self.extras)
         )
 
     def _zonal_matrices(self, state: MixedEffectsState) -> _ZonalMatrices:
         """The weighted zonal matrix of a state and its parts."""
         registration, w, weigh = Registration.from_array(state.alpha), 1.0 + state.width, self.weighted.weigh
-        zonal_matrix, jacobian = (weigh(part) for part in zonal_jacobian(self.model, registration, w))
-        base = jacobian
+        shaped = self.shape.linearise(registration, w, state.shape)
+        nominal, jacobian, total = weigh(shaped.nominal), weigh(shaped.jacobian), weigh(shaped.matrix)
         variants = []
         for variant, share in zip(self.variants, state.variant, strict=False):
             if abs(share) < _SMALL_SHARE:
-                variants.append(weigh(variant.zonal_matrix(registration, w)) - zonal_matrix)
+                variants.append(weigh(variant.zonal_matrix(registration, w)) - nominal)
                 continue
             # A large share changes the derivatives by the registration.
             changed, changes = (weigh(part) for part in zonal_jacobian(variant, registration, w))
-            variants.append(changed - zonal_matrix)
-            jacobian = jacobian + share * (changes - base)
-        by_profile = []
-        dipoles = [self._outward_derivative(base)]
-        for relative_width, share in zip(PROFILE_WIDTHS, state.profile, strict=True):
-            component, changes = (
-                weigh(part) for part in component_jacobian(self.model, registration, w, relative_width)
-            )
-            jacobian = jacobian + share * (changes - base)
-            dipoles.append(relative_width**2 * self._outward_derivative(changes))
-            by_profile.append(component - zonal_matrix)
+            variants.append(changed - nominal)
+            jacobian = jacobian + share * (changes - weigh(shaped.base))
         by_width = jacobian[5] * w
         first = len(self.variants)
         for extra, share in zip(self.extras, state.variant[first:], strict=False):
             variants.append(weigh(extra.matrix_change(registration, w, float(share))))
-        variants += [zonal_matrix @ command_curve for command_curve in self.command_curves]
-        _, width, along_x, along_y = state.actuator
-        total = zonal_matrix + width * by_width + along_x * jacobian[0] + along_y * jacobian[1]
-        for share, difference in zip(state.profile, by_profile, strict=True):
-            total = total + share * difference
-        by_edge = [self.edge * part for part in (total, by_width, *by_profile, *dipoles)]
-        by_fourfold = [weigh(part) for part in self._fourfold(registration, w)]
-        for share, difference in zip(state.fourfold, by_fourfold, strict=True):
-            total = total + share * difference
-        for share, difference in zip(state.edge, by_edge, strict=True):
-            total = total + share * difference
+        variants += [nominal @ command_curve for command_curve in self.command_curves]
         for share, difference in zip(state.variant, variants, strict=True):
             total = total + share * difference
-        return _ZonalMatrices(jacobian, by_width, by_profile, by_edge, by_fourfold, variants, total)
+        _, width, along_x, along_y = state.actuator
+        total = total + width * by_width + along_x * jacobian[0] + along_y * jacobian[1]
+        terms = [weigh(term) for term in shaped.terms]
+        return _ZonalMatrices(jacobian, by_width, terms, variants, total)
 
     def matrix(self, state: MixedEffectsState, m2c: NDArray[np.float64]) -> NDArray[np.float64]:
         """Slopes per unit of modes ``m2c (n_act, n)`` at a state, random effects included."""
@@ -235,7 +206,7 @@ class MixedEffectsProblem:
             return np.asarray(rows * (zonal @ scaled_modes))
 
         unit = modal(z.total)
-        parts = (*z.jacobian, *z.by_profile, *z.by_edge, *z.by_fourfold, *z.variants)
+        parts = (*z.jacobian, *z.terms, *z.variants)
         common = np.stack([unit, *(state.gain * modal(part) for part in parts)])
         # A sampling position acts as a shift shared by the lenslets of a column (x) or a row (y).
         half = unit.shape[0] // 2
@@ -246,27 +217,6 @@ class MixedEffectsProblem:
             state.gain * (z.total @ scaled_modes), self.weighted.data - model, self.precision,
             self.offset(state), sampling_derivative, self.lines, self.trends,
         )  # fmt: skip
-
-    def _outward_derivative(self, jacobian: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Derivative of the zonal matrix by outward positions of the actuators ``(n_slopes, n_act)``."""
-        return np.asarray(jacobian[0] * self.outward[0] + jacobian[1] * self.outward[1])
-
-    def _fourfold(self, registration: Registration, width: float) -> list[NDArray[np.float64]]:
-        """Four-fold terms of the zonal matrix ``(n_slopes, n_act)``: lobes along the axes less those between."""
-        if not self.pitch:
-            return [np.zeros((self.weighted.data.shape[0], self.model.n_act))] * N_FOURFOLD
-        terms, affine = [], registration.affine(self.model.sub_aperture_m)[0]
-        for distance, relative_width in FOURFOLD_LOBES:
-            total = 0.0
-            for number in range(8):
-                angle = number * np.pi / 4
-                shift = affine @ (self.pitch * distance * np.array([np.cos(angle), np.sin(angle)]))
-                lobe = replace(
-                    registration, shift_x=registration.shift_x + shift[0], shift_y=registration.shift_y + shift[1]
-                )
-                total = total + (-1.0) ** number * self.model.zonal_matrix(lobe, width * relative_width)
-            terms.append(np.asarray(total))
-        return terms
 
     def _actuator_derivatives(
         self, z: _ZonalMatrices, actuator_factor: NDArray[np.float64]
@@ -290,87 +240,64 @@ class MixedEffectsProblem:
         return np.asarray(scale[:, None] * sampled_matrix * (1 + state.actuator_gain))
 
     def estimate_priors(self, state: MixedEffectsState, system: NormalEquations) -> PriorEstimate:
-        """Estimate the scatter of the random effects from a solution.
-
-        One step of expectation and maximisation (Dempster, Laird & Rubin 1977): the most likely variance of
-        a group of effects is the mean square of their estimates plus their mean posterior variance. Where
-        the data have no information that is the prior; the scatter of an absent effect decreases from step
-        to step.
-        """
+        """Estimate the scatter of the random effects from a solution (:func:`estimate_scatters`)."""
+        groups = self._effect_groups(system)
+        usual, inner = Priors(), len(system.schur_complement)
+        names = [*groups, "slope_gain"]
+        low, high = (
+            {name: ratio * getattr(usual, name) for name in names} for ratio in (_MIN_PRIOR_RATIO, _MAX_PRIOR_RATIO)
+        )
+        # A misfit of the model enlarges the noise that the effects are compared with.
+        rms = float(np.sqrt(np.mean(np.square(system.residual))))
+        noise = max(rms, self.weighted.noise_level(system.residual))
+        found = estimate_scatters(
+            system.schur_complement, self.offset(state)[:inner], self.precision[:inner], list(groups.values()),
+            [(low[name], high[name]) for name in groups], noise,
+        )  # fmt: skip
+        scatter = dict(zip(groups, found, strict=True))
+        # The slope gains were eliminated: one step of expectation and maximisation (Dempster, Laird & Rubin 1977).
         variance = system.posterior_variance()
-        head, n_act = VARIANTS + self.n_variants, self.model.n_act
-        counts = (self.n_lines, self.trends.shape[1], N_ACTUATOR_EFFECTS * n_act)
-        lines, _, actuators, slopes = np.split(variance[head:], np.cumsum(counts))
-        gains, widths, *positions = self.priors.noise_inflation * actuators.reshape(-1, n_act)
-        squares = {
-            "sampling": np.square(state.sampling) + lines,
-            "actuator_gain": np.square(state.actuator[0]) + gains,
-            "actuator_width": np.square(state.actuator[1]) + widths,
-            "actuator_position": np.square(state.actuator[2:]) + np.array(positions),
-            "slope_gain": np.square(state.slope_gain) + slopes,
-        }
-        usual = Priors()
-        scatter = {
-            name: max(float(np.sqrt(np.mean(square))), _MIN_PRIOR_RATIO * getattr(usual, name))
-            for name, square in squares.items()
-        }
-        if self.trends.shape[1]:
-            scatter["noise_inflation"] = system.estimate_noise_inflation()
-        n_effective_parameters = float(np.sum(1 - variance * self.precision))
-        return PriorEstimate(replace(self.priors, **scatter), n_effective_parameters)
+        mean_square = float(np.mean(np.square(state.slope_gain) + variance[inner:]))
+        scatter["slope_gain"] = float(np.clip(np.sqrt(mean_square), low["slope_gain"], high["slope_gain"]))
+        inflation = system.estimate_noise_inflation() if self.trends.shape[1] else 1.0
+        priors = replace(self.priors, **scatter, noise_inflation=inflation)
+        return PriorEstimate(priors, float(np.sum(1 - variance * self.precision)))
+
+    def _effect_groups(self, system: NormalEquations) -> dict[str, NDArray[np.intp]]:
+        """Unknowns of each group of random effects, by the name of its scatter in :class:`Priors`."""
+        inner, n_act = len(system.schur_complement), self.model.n_act
+        first = inner - N_ACTUATOR_EFFECTS * n_act
+        lines = np.arange(first - self.trends.shape[1] - self.n_lines, first - self.trends.shape[1])
+        groups = {"sampling": lines}
+        for number, name in enumerate(_ACTUATOR_PRIORS):
+            members = np.arange(first + number * n_act, first + (number + 1) * n_act)
+            groups[name] = np.concatenate([groups[name], members]) if name in groups else members
+        return groups
 
     def actuator_corrections(self, state: MixedEffectsState, system: NormalEquations) -> ActuatorCorrections:
         """Differences between the mirror of a solution and the nominal one."""
-        # The slope gains, eliminated first, come last.
         inner = len(system.schur_complement)
-        n_act = self.model.n_act
-        first = inner - N_ACTUATOR_EFFECTS * n_act
-        groups = [slice(first + k * n_act, first + (k + 1) * n_act) for k in range(N_ACTUATOR_EFFECTS)]
-        usual = Priors()
-        bounds = [
-            (_MIN_PRIOR_RATIO * getattr(usual, name), _MAX_PRIOR_RATIO * getattr(usual, name))
-            for name in _ACTUATOR_PRIORS
-        ]
-        # A misfit of the model enlarges the noise that the effects are compared with.
-        rms = float(np.sqrt(np.mean(np.square(system.residual))))
-        value, sigma = empirical_bayes(
-            system.schur_complement, self.offset(state)[:inner], self.precision[:inner], groups, bounds,
-            max(rms, self.weighted.noise_level(system.residual)),
-        )  # fmt: skip
-        gains, widths, along_x, along_y = groups
-        positions = np.stack([value[along_x], value[along_y]])
-        return ActuatorCorrections(value[gains], sigma[gains], value[widths], state.profile, positions)
+        variance = np.diag(np.linalg.inv(system.schur_complement))[inner - N_ACTUATOR_EFFECTS * self.model.n_act :]
+        noise = self.weighted.noise_level(system.residual)
+        gain_sigma = noise * np.sqrt(variance[: self.model.n_act])
+        gain, width, *position = state.actuator
+        return ActuatorCorrections(gain, gain_sigma, width, state.shape, np.array(position))
 
     def move(self, state: MixedEffectsState, step: NDArray[np.floating]) -> MixedEffectsState:
         """The state after a step, in the order of the unknowns."""
         n_act = self.model.n_act
         counts = self.n_variants, self.n_lines, self.trends.shape[1], N_ACTUATOR_EFFECTS * n_act
-        variant, sampling, trend, actuators, slopes = np.split(step[VARIANTS:], np.cumsum(counts))
+        variant, sampling, trend, actuators, slopes = np.split(step[self.first_variant :], np.cumsum(counts))
         # The matrix is linear in gain times share, so the step is exact in that product.
         gain = state.gain + step[GAIN]
         gain_ratio = state.gain / gain if gain > _MIN_GAIN_RATIO * state.gain else 1.0
         return MixedEffectsState(
             gain, state.alpha + step[1:6],
             float(np.clip(state.width + step[WIDTH], -0.5, 1.0)),
-            state.profile + gain_ratio * step[PROFILE:EDGE], state.edge + step[EDGE:FOURFOLD],
-            state.fourfold + gain_ratio * step[FOURFOLD:VARIANTS],
+            state.shape + gain_ratio * step[SHAPE : self.first_variant],
             state.variant + gain_ratio * variant, state.sampling + sampling, state.trend + trend,
             state.actuator + actuators.reshape(-1, n_act), state.slope_gain + slopes,
         )  # fmt: skip
-
-
-def edge_actuators(model: SyntheticModel) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
-    """One for edge actuators, else zero ``(n_act,)``, outward ``(2, n_act)``, and pitch in % of a sub-aperture."""
-    if not hasattr(model, "actuator_positions_m"):
-        return np.zeros(model.n_act), np.zeros((2, model.n_act)), 0.0
-    positions = model.actuator_positions_m
-    centred = positions - positions.mean(axis=0)
-    distance = np.linalg.norm(positions[:, None] - positions, axis=2)
-    nearest = np.sort(distance, axis=1)[:, 1]
-    neighbours = (distance < 1.3 * np.median(nearest)).sum(axis=1)
-    edge = (neighbours < np.median(neighbours)).astype(float)
-    pitch = float(100 / model.sub_aperture_m * np.median(nearest))
-    return edge, 0.55 * pitch * (centred / np.maximum(np.linalg.norm(centred, axis=1), 1e-12)[:, None]).T, pitch
 
 
 def slope_trends(model: SyntheticModel, valid: NDArray[np.bool_]) -> NDArray[np.float64]:
@@ -402,15 +329,15 @@ def slope_trends(model: SyntheticModel, valid: NDArray[np.bool_]) -> NDArray[np.
     return scatter * np.kron(np.eye(2), squares - squares.mean(axis=0))
 
 
-def empirical_bayes(
+def estimate_scatters(
     information: NDArray[np.float64],
     value: NDArray[np.float64],
     precision: NDArray[np.float64],
-    groups: Sequence[slice],
+    groups: Sequence[NDArray[np.intp]],
     bounds: Sequence[tuple[float, float]],
     noise: float = 1.0,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Posterior of random effects under the priors that maximise the evidence.
+) -> NDArray[np.float64]:
+    """Scatter of groups of random effects that maximises the evidence ``(n_groups,)``.
 
     The variance of each group is the fixed point ``sum x^2 / sum(1 - var / scatter^2)`` (MacKay 1992, eq.
     4.9 and 4.10), with a few zero effects added to the count. Unlike a chosen prior, it goes to its lower
@@ -425,26 +352,24 @@ def empirical_bayes(
     precision
         Present prior precisions ``(n,)``.
     groups
-        Unknowns that share a scatter.
+        Indices of the unknowns that share a scatter.
     bounds
         Smallest and largest scatter of each group.
     noise
         Noise of the data in the units of ``information``.
-
-    Returns
-    -------
-    value, sigma : ndarray, ``(n,)``
-        Posterior mean and standard error.
     """
     data = (information - np.diag(precision)) / noise**2
     # The gradient vanishes at the solution.
     right_hand_side = information @ value / noise**2
-    prior = precision.copy()
+    prior, scatters = precision.copy(), np.array([precision[group[0]] ** -0.5 for group in groups])
     for _ in range(_ITERATIONS):
         covariance = np.linalg.inv(data + np.diag(prior))
-        posterior_mean = covariance @ right_hand_side
-        for group, (smallest, largest) in zip(groups, bounds, strict=True):
-            n_determined = np.sum(1 - np.diag(covariance)[group] * prior[group])
-            square = np.square(posterior_mean[group]).sum() / (float(n_determined) + _PSEUDO_COUNT)
-            prior[group] = 1 / np.clip(square, smallest**2, largest**2)
-    return posterior_mean, np.sqrt(np.maximum(np.diag(covariance), 0.0))
+        posterior_mean, before = covariance @ right_hand_side, scatters.copy()
+        for number, (group, (smallest, largest)) in enumerate(zip(groups, bounds, strict=True)):
+            n_determined = float(np.sum(1 - np.diag(covariance)[group] * prior[group]))
+            square = np.square(posterior_mean[group]).sum() / (n_determined + _PSEUDO_COUNT)
+            scatters[number] = np.clip(np.sqrt(square), smallest, largest)
+            prior[group] = scatters[number] ** -2
+        if (np.abs(scatters / before - 1) < _NEGLIGIBLE_CHANGE).all():
+            break
+    return scatters

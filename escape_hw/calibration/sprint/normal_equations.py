@@ -31,8 +31,8 @@ class Priors:
         Position within its lenslet at which a slope samples the wavefront, in % of a sub-aperture; common
         to the x slopes of a column and to the y slopes of a row, which have the same alignment with the
         pixels.
-    width, profile
-        Common width of the influence functions, and the share of each component of their radial profile.
+    width
+        Common width of the influence functions.
     mean_width
         Prior mean of the relative width beyond nominal: zero, or the value of an earlier fit.
     extras
@@ -47,14 +47,8 @@ class Priors:
     actuator_gain: float = 0.1
     actuator_width: float = 0.05
     actuator_position: float = 5.0
-    edge_gain: float = 0.2
-    edge_width: float = 0.1
-    edge_profile: float = 0.1
-    edge_asymmetry: float = 0.1
-    fourfold: float = 0.05
     slope_gain: float = 0.1
     width: float = 0.2
-    profile: float = 0.3
     sampling: float = 0.5
     mean_width: float = 0.0
     extras: tuple[tuple[float, float], ...] = ()
