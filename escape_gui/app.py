@@ -18,10 +18,10 @@ from PySide6.QtWidgets import QApplication
 from escape_gui.client.connection import LiveSource, LocalServer, ServerAttachment
 from escape_gui.client.session import EmptySource, Session
 from escape_gui.main_window import MainWindow
-from escape_gui.replay.opener import is_recording
+from escape_gui.replay.playback import is_recording
 from escape_gui.replay.source import ReplaySource
 from escape_gui.settings import Settings, load_settings, settings_file
-from escape_gui.widgets.controls.status_indicator import Level
+from escape_gui.widgets.controls import Level
 from escape_gui.window.export import save_png
 from escape_hw.config.loader import load_system
 from escape_hw.errors import ConfigError

@@ -25,22 +25,17 @@ from escape_gui.client.availability import tooltip
 from escape_gui.client.session import Session
 from escape_gui.panels import PANELS
 from escape_gui.panels.base import Context, Panel
-from escape_gui.replay.opener import RecordingOpener
-from escape_gui.replay.player import PlaybackBar
+from escape_gui.replay.playback import PlaybackBar, RecordingOpener
 from escape_gui.replay.source import ReplaySource
 from escape_gui.settings import Settings, save_settings
 from escape_gui.theme import Theme
-from escape_gui.widgets.controls.overlay import Overlay
-from escape_gui.widgets.controls.status_indicator import Level
-from escape_gui.widgets.layouts import column
-from escape_gui.window.actions import ACTIONS, MENUS
-from escape_gui.window.dock import Dock
+from escape_gui.widgets.controls import Level, Overlay, column
+from escape_gui.window.actions import ACTIONS, MENUS, format_shortcuts, help_page, keyboard_table
+from escape_gui.window.docks import WORKSPACES, Dock, arrange_docks, hide_orphan_tab_bars, workspace
 from escape_gui.window.export import Exporter
 from escape_gui.window.header import FaultBanner, HeaderBar
-from escape_gui.window.help_pages import format_shortcuts, help_page, keyboard_table
 from escape_gui.window.notifications import NotificationBar, StateNotifier
 from escape_gui.window.update_timer import UpdateTimer
-from escape_gui.window.workspaces import WORKSPACES, arrange_docks, hide_orphan_tab_bars, workspace
 from escape_hw.errors import StorageError
 
 log = logging.getLogger(__name__)
@@ -51,18 +46,9 @@ REPLAY_WORKSPACE = "calibrate"
 
 
 class MainWindow(QMainWindow):
-    """Window on one data source.
+    """Window on one data source, whose session it does not close.
 
-    Parameters
-    ----------
-    session
-        Data and requests; not closed by the window.
-    settings
-        Theme, font size and layouts.
-    settings_path
-        File in which the settings are saved on closing; ``None``: not saved.
-    panels
-        Classes of the panels to create.
+    The settings are saved into the file ``settings_path``, if given, on closing.
     """
 
     def __init__(
@@ -335,7 +321,7 @@ class MainWindow(QMainWindow):
         The safety buttons of a window on a bench must remain those of the bench.
         """
         session = self.context.session
-        if session.requests is None:
+        if session.control is None:
             session.set_source(source, None)
             self.show_workspace(REPLAY_WORKSPACE)
             return

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import platformdirs
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -33,15 +33,7 @@ def settings_file() -> Path:
 
 
 def load_settings(path: Path) -> tuple[Settings, tuple[str, ...]]:
-    """Read settings and ignore invalid entries.
-
-    Returns
-    -------
-    settings : Settings
-        Valid entries, and defaults for the others.
-    warnings : tuple of str
-        One line per ignored entry; empty for a valid or missing file.
-    """
+    """Read settings; invalid entries are ignored, with a warning for each."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
@@ -50,10 +42,6 @@ def load_settings(path: Path) -> tuple[Settings, tuple[str, ...]]:
         return Settings(), (f"{path}: cannot be read ({error}); using the default settings",)
     if not isinstance(content, dict):
         return Settings(), (f"{path}: not a table of settings; using the default settings",)
-    return _valid_settings(path, content)
-
-
-def _valid_settings(path: Path, content: dict[str, Any]) -> tuple[Settings, tuple[str, ...]]:
     settings, warnings = Settings(), []
     for key, value in content.items():
         if key not in Settings.model_fields:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Literal
@@ -78,6 +79,11 @@ class Theme(QObject):
         super().__init__()
         self.palette_name: PaletteName = palette_name
         self.scale = min(max(scale, SCALES[0]), SCALES[-1])
+
+    def follow(self, apply: Callable[[], object]) -> None:
+        """Call a function now and at every change."""
+        self.changed.connect(apply)
+        apply()
 
     @property
     def colours(self) -> Palette:

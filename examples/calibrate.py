@@ -20,7 +20,9 @@ with escape_hw.open_system("razor-shwfs") as bench:
     escape = bench.calibrate("escape", frames=FRAMES, progress=True)
     injected = bench.config.twin.registration.to_registration()  # true value, known for a twin only
 
-print(f"{escape.frames} frames in {escape.sky_seconds:.1f} s; delay {escape.response.delay:.2f} frames")
+print(
+    f"{escape.frames} frames in {escape.sky_seconds:.1f} s; delay {escape.response.delay_frames:.2f} frames"
+)
 
 # The result includes the DO-CRIME matrix, with a standard error for every element.
 docrime = replace(escape, matrix=escape.measured, registration=None)

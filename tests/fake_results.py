@@ -189,11 +189,11 @@ def sky_time() -> dict[str, object]:
     }
     return {
         "realisations": 20,
-        "fewest_frames": {"whitened": 500, "plain": None},
+        "fewest_frames": {"whitened": 500, "unwhitened": None},
         "frames": frames,
         "estimators": {
             "whitened": {name: [1.3 * v for v in values] for name, values in bound.items()},
-            "plain": {name: [25 * v for v in values] for name, values in bound.items()},
+            "unwhitened": {name: [25 * v for v in values] for name, values in bound.items()},
         },
         "bound": bound,
     }

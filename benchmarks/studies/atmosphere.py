@@ -7,13 +7,12 @@ Writes ``atmosphere.png``. Takes about a minute.
 
 from __future__ import annotations
 
-import argparse
 import math
-from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
 from numpy.typing import NDArray
+from realisation_tables import study_parser
 from scipy import special
 
 from escape_hw.report.figures import style
@@ -88,11 +87,7 @@ def draw_boiling(axes: Axes) -> None:
 
 def main() -> None:
     """Measure and draw."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--out", type=Path, default=Path("."))
-    options = parser.parse_args()
+    options = study_parser(__doc__).parse_args()
     figure = style.new_figure(8.0, 3.0)
     left, right = figure.subplots(1, 2)
     draw_structure(style.style_axes(left))

@@ -1,24 +1,22 @@
-"""From how far SPRINT finds home: random realisations two actuator pitches away, turned by up to ten degrees.
+"""Capture range of SPRINT: random registrations up to two actuator pitches and ten degrees away.
 
     python benchmarks/studies/capture_range.py --system razor-shwfs --realisations 100 --out docs/figures
     python benchmarks/studies/capture_range.py --system razor-pywfs --realisations 100 --out docs/figures
 
-Each realisation is a twin with all its imperfections, measured by push-pull on the calm beam, two frames per
-sign. SPRINT gets that matrix and a model built on the images found, and starts from zero. A realisation is
-recovered when SPRINT says it converged and every parameter is right within the tolerance, flagged when it
-says it did not, and wrong otherwise. Writes ``capture-SYSTEM.jsonl``, a line per realisation as soon as it is
-done; realisations that the file has already are not run again. Exits with 1 when a realisation was wrong or
-fewer than 95 in 100 were recovered. A realisation takes five seconds on an idle core, on a pyramid twenty.
+Each realisation is a twin with all its imperfections, measured by push-pull without turbulence, two frames
+per sign. SPRINT gets that matrix and a model built on the images found, and starts from zero. A realisation
+is recovered when SPRINT reports convergence and every parameter is right within the tolerance, flagged when
+it reports none, and wrong otherwise. Writes ``capture-SYSTEM.jsonl``: appends one line per realisation;
+realisations already in the file are skipped. Exits with 1 when a realisation was wrong or fewer than 95 in
+100 were recovered. A realisation takes five seconds on an idle core, on a pyramid twenty.
 """
 
 from __future__ import annotations
 
-import argparse
 import sys
-from pathlib import Path
 
 import numpy as np
-from realisation_tables import Line, each_realisation
+from realisation_tables import Line, each_realisation, realisation_numbers, study_parser
 
 from escape_hw.api.registration import Registration
 from escape_hw.calibration.sprint.fit import sprint
@@ -27,7 +25,7 @@ from escape_hw.runtime.session.system import System
 
 #: Largest shift in actuator pitches, rotation in degrees, scaling in %.
 PITCHES, ROTATION, SCALING = 2.0, 10.0, 4.0
-#: Right within this: a fifth of a pitch in shift would be another lap of the descent.
+#: Tolerance of a recovered registration; its shift in actuator pitches.
 TOLERANCE_PITCH, TOLERANCE_REST = 0.05, np.array([0.3, 1.0, 1.0])
 
 
@@ -41,7 +39,7 @@ def distant_registration(number: int, pitch: float) -> Registration:
 
 
 def run_realisation(system: str, number: int) -> Line:
-    """Measure one realisation and look for it."""
+    """Measure one realisation and estimate its registration."""
     config = simulated_config(system)
     pitch = 100 * config.sensor.n_sub / config.devices.dm.pitches_across_pupil
     injected = distant_registration(number, pitch)
@@ -60,18 +58,11 @@ def run_realisation(system: str, number: int) -> Line:
 
 
 def main() -> int:
-    """Run the realisations, count, write."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--system", default="razor-shwfs")
-    parser.add_argument("--first", type=int, default=0)
-    parser.add_argument("--realisations", type=int, default=100)
-    parser.add_argument("--out", type=Path, default=Path("."))
-    options = parser.parse_args()
+    """Measure what is missing, and count the outcomes."""
+    options = study_parser(__doc__, "razor-shwfs", 100).parse_args()
     target = options.out / f"capture-{options.system}.jsonl"
     rows = each_realisation(
-        target, {"system": options.system}, range(options.first, options.first + options.realisations),
+        target, {"system": options.system}, realisation_numbers(options),
         lambda number: run_realisation(options.system, number),
         lambda row: f"{row['outcome']} after {row['steps']} steps",
     )  # fmt: skip

@@ -3,22 +3,29 @@
     python benchmarks/studies/closed_loop_sky_time.py --realisations 10 --frames 1000 --out closed
 
 Each realisation is calibrated in open loop first (1,200 frames at the usual poke); its pseudo-synthetic
-matrix closes the loop, and pokes of the given size beside the integrator find the registration again, from
-nothing of the calibration before but its matrix. Writes ``closed-sky-time.jsonl``, a line per realisation as
-soon as it is done; realisations that the file has already are not run again. Prints rms errors with, in
-brackets, normalised chi-squared and mean error. A realisation takes half a minute on one core.
+matrix closes the loop, and the registration is estimated again from pokes of the given size in closed loop.
+Of the first calibration only the matrix is used. Writes ``closed-sky-time.jsonl``: appends one line per
+realisation; realisations already in the file are skipped. Prints rms errors with, in brackets, normalised
+chi-squared and mean error. A realisation takes half a minute on one core.
 """
 
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
 import numpy as np
-from realisation_tables import Line, array, each_realisation, row, to_json
+from realisation_tables import (
+    Line,
+    array,
+    each_realisation,
+    realisation_numbers,
+    row,
+    study_parser,
+    to_json,
+)
 
 from escape_hw.errors import CalibrationError
-from escape_hw.paper.sky_time import GOAL, random_registration, registration_overrides, simulated_config
+from escape_hw.paper.sky_time import GOAL, realisation_config
 from escape_hw.runtime.session.system import System
 
 #: Frames of the calibration that closes the loop.
@@ -27,8 +34,7 @@ START_FRAMES = 1200
 
 def measure_realisation(options: argparse.Namespace, number: int) -> Line:
     """Errors and stated errors of a realisation ``(n_frames, 5)``, that of the closing calibration first."""
-    injected = random_registration(number)
-    config = simulated_config(options.system, registration_overrides(injected), seed=number + 1)
+    injected, config = realisation_config(options.system, number)
     errors, sigmas = np.full((2, 1 + len(options.frames), 5), np.nan)
     with System.from_config(config) as bench:
         closed_loop = bench.calibrate(frames=START_FRAMES)
@@ -44,21 +50,16 @@ def measure_realisation(options: argparse.Namespace, number: int) -> Line:
 
 
 def main() -> None:
-    """Parse, measure what is missing, tell."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--system", default="razor-shwfs")
-    parser.add_argument("--first", type=int, default=0)
-    parser.add_argument("--realisations", type=int, default=10)
+    """Measure what is missing, and print the table."""
+    parser = study_parser(__doc__, "razor-shwfs", 10)
     parser.add_argument("--frames", type=int, nargs="+", default=[1000])
     parser.add_argument("--poke", type=float, default=0.002)
-    parser.add_argument("--out", type=Path, default=Path("."))
     options = parser.parse_args()
     target = options.out / "closed-sky-time.jsonl"
-    numbers = range(options.first, options.first + options.realisations)
     asked = {"system": options.system, "frames": options.frames, "poke": options.poke}
-    lines = each_realisation(target, asked, numbers, lambda number: measure_realisation(options, number))
+    lines = each_realisation(
+        target, asked, realisation_numbers(options), lambda number: measure_realisation(options, number)
+    )
     errors, sigmas = (np.stack([array(line[name]) for line in lines]) for name in ("errors", "sigmas"))
     for k, label in enumerate([f"{START_FRAMES} open", *options.frames]):
         within = (np.abs(errors[:, k]) <= GOAL).all(axis=1).sum()

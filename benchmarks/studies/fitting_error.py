@@ -9,10 +9,9 @@ and the Strehl ratio ``exp(-phase variance)`` (Marechal). Ten seconds on an idle
 
 from __future__ import annotations
 
-import argparse
-
 import numpy as np
 from numpy.typing import NDArray
+from realisation_tables import study_parser
 
 from escape_hw.api.registration import Registration
 from escape_hw.calibration.modes.bases import karhunen_loeve
@@ -68,10 +67,7 @@ def _fit_residual(
 
 def main() -> None:
     """Print a line per number of modes."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--system", default="maps-nir")
+    parser = study_parser(__doc__, "maps-nir")
     parser.add_argument("--modes", type=int, nargs="+", default=[50, 100, 200, 300])
     options = parser.parse_args()
     for n_modes in options.modes:

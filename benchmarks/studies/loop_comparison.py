@@ -1,7 +1,7 @@
 """Strehl ratios on equal turbulence of ESCAPE with optical gains, push-pull (the baseline) and DO-CRIME
 alone.
 
-    python benchmarks/studies/loop_comparison.py --seeds 1 2 3 4 5 6 7 8 9 10 --keep paired
+    python benchmarks/studies/loop_comparison.py --seeds 1 2 3 4 5 6 7 8 9 10 --out paired
 
 Each seed is a twin with a mirror and turbulence of its own. Every matrix is closed at its own best gain,
 found on the first seconds of that turbulence, and judged on later ones, the same for all three. Matrices and
@@ -23,6 +23,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from realisation_tables import append_line, read_lines, study_parser
 
 from escape_hw.api.results import CalibrationResult
 from escape_hw.calibration.loop.performance import close_loop
@@ -59,11 +60,10 @@ class SeedRun:
 
     def __init__(self, options: argparse.Namespace, number: int, until: float) -> None:
         self.options, self.number, self._until = options, number, until
-        self._folder = options.keep / f"{options.system}-{number}"
+        self._folder = options.out / f"{options.system}-{number}"
         self._folder.mkdir(parents=True, exist_ok=True)
         self._lines = self._folder / "loops.jsonl"
-        known = self._lines.read_text().splitlines() if self._lines.exists() else []
-        self._records: dict[str, dict[str, Any]] = {row["what"]: row for row in map(json.loads, known)}
+        self._records: dict[str, dict[str, Any]] = {row["what"]: row for row in read_lines(self._lines)}
 
     def open_bench(self) -> System:
         """A bench in its first state: what is done on it does not depend on what was done before."""
@@ -97,8 +97,7 @@ class SeedRun:
     def add_record(self, what: str, found: dict[str, Any]) -> None:
         """Write a line into the book."""
         self._records[what] = {"what": what, **found}
-        with self._lines.open("a") as lines:
-            lines.write(json.dumps(self._records[what]) + "\n")
+        append_line(self._lines, self._records[what])
         print(f"seed {self.number}: {json.dumps(self._records[what])}", flush=True)
 
 
@@ -196,13 +195,10 @@ def table(found: dict[int, dict[str, tuple[float, float]]]) -> list[str]:
 
 def main() -> None:
     """Measure what is missing, and print what there is."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--system", default="razor-pywfs")
+    parser = study_parser(__doc__, "razor-pywfs")
     parser.add_argument("--set", nargs="*", default=[])
     parser.add_argument("--seeds", nargs="+", type=int, default=list(range(1, 11)))
-    parser.add_argument("--keep", type=Path, default=Path("paired"), help="folder for what is done")
+    parser.set_defaults(out=Path("paired"))
     parser.add_argument("--minutes", type=float, default=np.inf, help="begin nothing after so long")
     parser.add_argument("--calibration", type=int, default=1500, help="frames of ESCAPE")
     parser.add_argument("--baseline", type=int, default=20, help="push-pull: frames per push and per pull")

@@ -11,11 +11,11 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from collections.abc import Callable, Iterator
 from contextlib import closing
 from typing import Any
 
 import numpy as np
+from realisation_tables import study_parser
 
 from escape_hw.api.pyramid import PyramidPupils
 from escape_hw.api.results import CalibrationResult
@@ -118,13 +118,10 @@ def pokes(bench: System, options: argparse.Namespace) -> dict[str, Any]:
     return document
 
 
-def options_of(arguments: list[str] | None = None) -> argparse.Namespace:
-    """The command line."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+def main() -> None:
+    """Print one document for each seed."""
+    parser = study_parser(__doc__, "razor-pywfs")
     parser.add_argument("what", choices=("gains", "pokes"))
-    parser.add_argument("--system", default="razor-pywfs")
     parser.add_argument("--set", nargs="*", default=[])
     parser.add_argument("--seeds", nargs="+", type=int, default=[1, 2, 3])
     parser.add_argument("--calibration", type=int, default=1500, help="frames of ESCAPE")
@@ -137,24 +134,13 @@ def options_of(arguments: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument(
         "--every", type=int, default=6, help="modes from one to the next that the truth is made for"
     )
-    return parser.parse_args(arguments)
-
-
-def documents(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
-    """One for each seed."""
-    what: Callable[[System, argparse.Namespace], dict[str, Any]]
-    what = {"gains": gains, "pokes": pokes}[options.what]
+    options = parser.parse_args()
     for seed in options.seeds:
         began = time.monotonic()
         with open_system(options.system, seed=seed, set=options.set) as bench:
-            document = what(bench, options)
-        yield {"what": options.what, "seed": seed, **document, "wall_s": round(time.monotonic() - began, 1)}
-
-
-def main() -> None:
-    """Parse, and do one of the two."""
-    for one in documents(options_of()):
-        print(json.dumps(one), flush=True)
+            document = (gains if options.what == "gains" else pokes)(bench, options)
+        wall_s = round(time.monotonic() - began, 1)
+        print(json.dumps({"what": options.what, "seed": seed, **document, "wall_s": wall_s}), flush=True)
 
 
 if __name__ == "__main__":

@@ -4,7 +4,7 @@
 
 Everything but gain, registration and the model's variants is known here: where the images lie, how strong the
 turbulence is, and the model is taken about the injected registration. Frames are fitted directly, by least
-squares with each slope's noise, as they are (plain) and as differences of neighbours (whitened), with no
+squares with each slope's noise, as they are (unwhitened) and as differences of neighbours (whitened), with no
 matrix in between. What is left is noise and the states of the turbulence; the third curve is what the model
 says of these: the scatter of one state over the root of the states that were seen. Writes
 ``pyramid-frames-SYSTEM.json`` and ``.png``; a realisation takes some ten seconds.
@@ -12,32 +12,27 @@ says of these: the scatter of one state over the root of the states that were se
 
 from __future__ import annotations
 
-import argparse
 import json
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from realisation_tables import study_parser
 
 from escape_hw.api.pyramid import PyramidPupils
 from escape_hw.api.registration import PARAMETERS
 from escape_hw.api.sensor import require_kind
 from escape_hw.calibration.docrime.estimator import DocrimeEstimator
 from escape_hw.calibration.docrime.open_loop import docrime_run
-from escape_hw.calibration.sprint.telemetry_fit import delayed, telemetry_from_frames
+from escape_hw.calibration.sprint.telemetry_fit import delay_rows, telemetry_from_frames
 from escape_hw.config.sensor import PyramidSection
-from escape_hw.paper.sky_time import (
-    accuracy_goal,
-    random_registration,
-    registration_overrides,
-    simulated_config,
-)
+from escape_hw.paper.sky_time import accuracy_goal, realisation_config
 from escape_hw.report.figures.registration import error_curves
 from escape_hw.runtime.session.system import System
 from escape_sim.models.pyramid import PyramidModel
 
-NAMES = ("plain", "whitened", "states of turbulence")
+NAMES = ("unwhitened", "whitened", "states of turbulence")
 
 
 def fit_registration(
@@ -60,8 +55,7 @@ def run_realisation(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Errors ``(2, n_frames, 5)`` of one realisation, and the variance that the turbulence's states
     explain."""
-    injected = random_registration(number)
-    config = simulated_config(system, [*overrides, *registration_overrides(injected)], seed=number + 1)
+    injected, config = realisation_config(system, number, overrides)
     with System.from_config(config) as bench:
         found = bench.run(docrime_run(bench, frames=max(frames), record=True))
     if found.record is None:
@@ -81,7 +75,7 @@ def run_realisation(
     data = telemetry_from_frames(index, slopes, pokes, before=lags)
     response = DocrimeEstimator(slopes.shape[1], pokes.shape[1], lags=lags, correlations=False)
     weights = response.extend(index, slopes, pokes).solve().response.weights
-    excitation = np.sum([w * delayed(data.pokes, lag) for lag, w in enumerate(weights)], axis=0)
+    excitation = np.sum([w * delay_rows(data.pokes, lag) for lag, w in enumerate(weights)], axis=0)
     pairs = data.present[1:] & data.present[:-1]
     series = (
         (data.slopes[data.present], excitation[data.present]),
@@ -94,15 +88,11 @@ def run_realisation(
 
 def main() -> None:
     """Parse, measure, write."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--system", default="maps-nir")
+    parser = study_parser(__doc__, "maps-nir")
     parser.add_argument("--realisations", type=int, default=10)
     parser.add_argument("--frames", type=int, nargs="+", default=[150, 300, 750, 1500])
     parser.add_argument("--set", dest="overrides", nargs="*", default=[])
     parser.add_argument("--curves", type=Path, help="draw what was measured before")
-    parser.add_argument("--out", type=Path, default=Path("."))
     options = parser.parse_args()
     if options.curves is not None:
         curves = json.loads(options.curves.read_text())

@@ -1,7 +1,8 @@
-"""Errors over random realisations: saved line by line, printed as the rows of a Markdown table."""
+"""What the studies share: command line, lines of JSON that a later run continues, rows of Markdown tables."""
 
 from __future__ import annotations
 
+import argparse
 import json
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -14,6 +15,38 @@ from numpy.typing import NDArray
 Line = dict[str, Any]
 
 
+def study_parser(
+    description: str | None, system: str | None = None, realisations: int | None = None
+) -> argparse.ArgumentParser:
+    """The options of most studies: ``--out``, ``--system`` with a default, and the range of realisations."""
+    parser = argparse.ArgumentParser(
+        description=description, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    if system is not None:
+        parser.add_argument("--system", default=system)
+    if realisations is not None:
+        parser.add_argument("--first", type=int, default=0, help="number of the first realisation")
+        parser.add_argument("--realisations", type=int, default=realisations, help="how many")
+    parser.add_argument("--out", type=Path, default=Path("."), help="folder of the results")
+    return parser
+
+
+def realisation_numbers(options: argparse.Namespace) -> range:
+    """The realisations that the options of :func:`study_parser` ask for."""
+    return range(options.first, options.first + options.realisations)
+
+
+def read_lines(path: Path) -> list[Any]:
+    """The values of a file of JSON lines; none of a file that does not exist."""
+    return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+
+
+def append_line(path: Path, value: Any) -> None:
+    """Append a value to a file of JSON lines."""
+    with path.open("a") as file:
+        file.write(json.dumps(value) + "\n")
+
+
 def each_realisation(
     target: Path,
     asked: Line,
@@ -21,40 +54,35 @@ def each_realisation(
     measure: Callable[[int], Line],
     describe: Callable[[Line], str] = lambda line: "done",
 ) -> list[Line]:
-    """The lines of some realisations, measured unless the file has them already, a line as soon as it is
-    done.
+    """The lines of some realisations; those that the file lacks are measured and appended one by one.
 
     Parameters
     ----------
     target
         File with one JSON object per line.
     asked
-        What was asked for, such as frames and settings; kept in every line.
-    numbers
-        The realisations.
+        Settings such as the frames, saved in every line.
     measure
-        Gives the line of a realisation.
-    told
+        Returns the line of a realisation.
+    describe
         What to print of a new line.
 
     Raises
     ------
     SystemExit
-        The file has realisations that were asked for otherwise, which do not belong into the same table.
+        The file has realisations with other settings.
     """
     asked = json.loads(json.dumps(asked))
     target.parent.mkdir(parents=True, exist_ok=True)
-    known = [*map(json.loads, target.read_text().splitlines())] if target.exists() else []
+    known = read_lines(target)
     if any(line["asked"] != asked for line in known):
         raise SystemExit(f"{target} has realisations that were asked for otherwise; choose another --out")
     lines = {line["realisation"]: line for line in known}
     for number in numbers:
-        if number in lines:
-            continue
-        lines[number] = {"realisation": number, "asked": asked, **measure(number)}
-        with target.open("a") as file:
-            file.write(json.dumps(lines[number]) + "\n")
-        print(f"realisation {number}: {describe(lines[number])}", flush=True)
+        if number not in lines:
+            lines[number] = {"realisation": number, "asked": asked, **measure(number)}
+            append_line(target, lines[number])
+            print(f"realisation {number}: {describe(lines[number])}", flush=True)
     return [lines[number] for number in sorted(lines)]
 
 

@@ -1,5 +1,4 @@
-"""What a calibration's registration errs by: random realisations, one run each, as `escape calibrate` does
-it.
+"""Error of the registration of a calibration, as `escape calibrate` makes it, over random realisations.
 
     python benchmarks/studies/registration_errors.py --system razor-pywfs --frames 1000 --realisations 20
     python benchmarks/studies/registration_errors.py --system maps-nir --frames 1500 --contaminated 0.28
@@ -7,30 +6,25 @@ it.
 Each realisation is a twin with all its imperfections, shifted by up to a sub-aperture, turned by up to two
 degrees and scaled by up to 4 %. On a telescope ``--contaminated`` is the share of the circumference that dirt
 covers: 0.28, to a fifth of the radius, are a tenth of the pupil, and 0 is a clean and evenly lit one. Writes
-``realisations-SYSTEM-NAME.jsonl``, a line per realisation as soon as it is done; realisations that the file
-has already are not run again. At the end: rms error, mean error and normalised chi-squared of those that
-converged, and the rms error of the images' mean place in pixels. A realisation takes about half a minute on
-an idle core.
+``realisations-SYSTEM-NAME.jsonl``: appends one line per realisation; realisations already in the file are
+skipped. Prints rms error, mean error and normalised chi-squared of those that converged, and the rms error of
+the images' mean place in pixels. A realisation takes about half a minute on an idle core.
 """
 
 from __future__ import annotations
 
-import argparse
-from pathlib import Path
-
 import numpy as np
-from realisation_tables import Line, each_realisation
+from realisation_tables import Line, each_realisation, realisation_numbers, study_parser
 
 from escape_hw.api.pyramid import PyramidPupils
 from escape_hw.config.sensor import PyramidSection
-from escape_hw.paper.sky_time import random_registration, registration_overrides, simulated_config
+from escape_hw.paper.sky_time import realisation_config
 from escape_hw.runtime.session.system import System
 
 
 def run_realisation(system: str, number: int, frames: int, overrides: list[str]) -> Line:
     """Calibrate one realisation, and compare with what was injected."""
-    injected = random_registration(number)
-    config = simulated_config(system, [*overrides, *registration_overrides(injected)], seed=number + 1)
+    injected, config = realisation_config(system, number, overrides)
     with System.from_config(config) as bench:
         found = bench.calibrate("escape", frames=frames)
     estimate, grid = found.registration, found.grid
@@ -56,7 +50,7 @@ def contamination_overrides(share: float) -> list[str]:
 
 
 def print_table(rows: list[Line]) -> None:
-    """Print what the realisations that converged say."""
+    """Print the statistics of the realisations that converged."""
     converged_rows = [row for row in rows if row["converged"]]
     of_these = "; of these:" if converged_rows else ""
     print(f"{len(rows)} realisations, {len(converged_rows)} converged{of_these}")
@@ -77,26 +71,20 @@ def print_table(rows: list[Line]) -> None:
 
 
 def main() -> None:
-    """Run the realisations, count, write."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--system", default="razor-pywfs")
+    """Measure what is missing, and print the table."""
+    parser = study_parser(__doc__, "razor-pywfs", 20)
     parser.add_argument("--frames", type=int, default=1000)
-    parser.add_argument("--first", type=int, default=0)
-    parser.add_argument("--realisations", type=int, default=20)
     parser.add_argument("--set", dest="overrides", nargs="*", default=[])
     parser.add_argument("--contaminated", type=float)
     parser.add_argument("--name", default="bundled")
-    parser.add_argument("--out", type=Path, default=Path("."))
     options = parser.parse_args()
-    overrides = options.overrides + (
-        [] if options.contaminated is None else contamination_overrides(options.contaminated)
-    )
+    overrides = options.overrides
+    if options.contaminated is not None:
+        overrides = overrides + contamination_overrides(options.contaminated)
     rows = each_realisation(
         options.out / f"realisations-{options.system}-{options.name}.jsonl",
         {"system": options.system, "frames": options.frames, "set": overrides},
-        range(options.first, options.first + options.realisations),
+        realisation_numbers(options),
         lambda number: run_realisation(options.system, number, options.frames, overrides),
         lambda row: str(np.round(row["error"], 3).tolist()),
     )

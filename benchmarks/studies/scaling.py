@@ -21,6 +21,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
+from realisation_tables import study_parser
 
 from escape_hw.config.bundled import bundled_systems
 from escape_hw.config.loader import load_system
@@ -256,10 +257,8 @@ def table(rows: list[dict[str, object]]) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--out", type=Path, default=Path("scaling"), help="folder of the points")
+    parser = study_parser(__doc__)
+    parser.set_defaults(out=Path("scaling"))
     parser.add_argument("--minutes", type=float, default=20.0, help="begin no point after this time")
     parser.add_argument("--limit", type=float, default=240.0, help="seconds for one point")
     parser.add_argument("--seconds", type=float, default=2.0, help="seconds of frames for one point")

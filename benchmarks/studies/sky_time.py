@@ -1,11 +1,11 @@
-"""Error of the registration against the frames spent: runs the campaign and draws its curves.
+"""Error of the registration against the number of frames: runs the campaign and draws its curves.
 
     python benchmarks/studies/sky_time.py --realisations 20 --frames 20 50 220 1000 --out docs/figures
-    python benchmarks/studies/sky_time.py --realisations 5 --frames 1000 8000 --estimators plain --out long
+    python benchmarks/studies/sky_time.py --realisations 5 --frames 1000 8000 --estimators unwhitened
 
-Writes ``sky-time.jsonl``, a line per realisation as soon as it is done, ``sky-time.json`` and
-``sky-time.png``, with the system's name behind for any but ``razor-shwfs``; realisations that the file has
-already are not run again. Prints rms errors with, in brackets, their ratio to the bound, normalised
+Writes ``sky-time.jsonl`` (appends one line per realisation; realisations already in the file are skipped),
+``sky-time.json`` and ``sky-time.png``, with the name of the system appended for any but ``razor-shwfs``.
+Prints rms errors with, in brackets, their ratio to the bound, normalised
 chi-squared and mean. Twenty realisations take about twenty minutes on one core (``escape reproduce sky-time``
 uses two); on a pyramid (``--system razor-pywfs``) the goal is that of its own sub-apertures, pixels of the
 pupil image.
@@ -15,10 +15,17 @@ from __future__ import annotations
 
 import argparse
 import json
-from pathlib import Path
 
 import numpy as np
-from realisation_tables import Line, array, each_realisation, row, to_json
+from realisation_tables import (
+    Line,
+    array,
+    each_realisation,
+    realisation_numbers,
+    row,
+    study_parser,
+    to_json,
+)
 
 from escape_hw.paper.sky_time import (
     ESTIMATORS,
@@ -53,23 +60,18 @@ def print_table(realisations: list[RealisationErrors], frames: list[int]) -> Non
 
 
 def main() -> None:
-    """Parse, measure what is missing, write."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--system", default="razor-shwfs")
-    parser.add_argument("--first", type=int, default=0)
-    parser.add_argument("--realisations", type=int, default=20)
+    """Measure what is missing, and write the curves."""
+    parser = study_parser(__doc__, "razor-shwfs", 20)
     parser.add_argument("--frames", type=int, nargs="+", default=list(FRAMES))
     parser.add_argument("--estimators", nargs="+", choices=ESTIMATORS, default=list(ESTIMATORS))
-    parser.add_argument("--out", type=Path, default=Path("."))
     options = parser.parse_args()
     options.frames.sort()
     name = "sky-time" if options.system == "razor-shwfs" else f"sky-time-{options.system}"
     target = options.out / f"{name}.jsonl"
-    numbers = range(options.first, options.first + options.realisations)
     asked = {"system": options.system, "frames": options.frames, "estimators": options.estimators}
-    lines = each_realisation(target, asked, numbers, lambda number: measure_realisation(options, number))
+    lines = each_realisation(
+        target, asked, realisation_numbers(options), lambda number: measure_realisation(options, number)
+    )
     realisations = [RealisationErrors(*(array(line[kept]) for kept in _KEPT)) for line in lines]
     curves = summary(realisations, options.frames, accuracy_goal(options.system))
     (options.out / f"{name}.json").write_text(json.dumps(curves, indent=1) + "\n")

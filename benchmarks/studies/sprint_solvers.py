@@ -8,7 +8,6 @@ in units of the default's, every variant on every matrix in the same run.
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -16,12 +15,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from realisation_tables import study_parser
 
 from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.synthetic_model import SyntheticModel
 from escape_hw.calibration.docrime.open_loop import docrime_run
 from escape_hw.calibration.sprint.fit import sprint
-from escape_hw.paper.sky_time import random_registration, registration_overrides, simulated_config
+from escape_hw.paper.sky_time import realisation_config
 from escape_hw.runtime.session.system import System
 
 #: What is tried, by name; the first is the default that times are given in units of.
@@ -32,21 +32,21 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "batches, rate 1": {"solver": "batches"},
     "batches, rate 0.2": {"solver": "batches", "learning_rate": 0.2, "max_iterations": 60},
     "diagonal": {"solver": "diagonal"},
-    "effects, 40 modes by snr": {"modes": 40},
-    "effects, first 40 modes": {"modes": 40, "choice": "first"},
-    "effects, 40 modes D-optimal": {"modes": 40, "choice": "d-optimal"},
-    "effects, 40 modes A-optimal": {"modes": 40, "choice": "a-optimal"},
-    "effects, 10 modes by snr": {"modes": 10},
-    "effects, first 10 modes": {"modes": 10, "choice": "first"},
-    "effects, 10 modes D-optimal": {"modes": 10, "choice": "d-optimal"},
-    "effects, Huber": {"loss": "huber"},
+    "mixed-effects, 40 modes by snr": {"modes": 40},
+    "mixed-effects, first 40 modes": {"modes": 40, "choice": "first"},
+    "mixed-effects, 40 modes D-optimal": {"modes": 40, "choice": "d-optimal"},
+    "mixed-effects, 40 modes A-optimal": {"modes": 40, "choice": "a-optimal"},
+    "mixed-effects, 10 modes by snr": {"modes": 10},
+    "mixed-effects, first 10 modes": {"modes": 10, "choice": "first"},
+    "mixed-effects, 10 modes D-optimal": {"modes": 10, "choice": "d-optimal"},
+    "mixed-effects, Huber": {"loss": "huber"},
 }
 #: The same with some sub-apertures that see something else.
 BAD_SUBAPERTURE_VARIANTS: dict[str, dict[str, Any]] = {
-    "bad sub-apertures: effects": {},
-    "bad sub-apertures: effects, Huber": {"loss": "huber"},
-    "bad sub-apertures: light": {"solver": "registration-only"},
-    "bad sub-apertures: light, Huber": {"solver": "registration-only", "loss": "huber"},
+    "bad sub-apertures: mixed-effects": {},
+    "bad sub-apertures: mixed-effects, Huber": {"loss": "huber"},
+    "bad sub-apertures: registration-only": {"solver": "registration-only"},
+    "bad sub-apertures: registration-only, Huber": {"solver": "registration-only", "loss": "huber"},
 }
 #: Share of sub-apertures that are spoiled, by taking the slopes of another one.
 _BAD = 0.03
@@ -64,8 +64,7 @@ class SolverCase:
 
 def measure(system: str, number: int, frames: int) -> SolverCase:
     """DO-CRIME on random realisation ``number``, all imperfections on."""
-    injected = random_registration(number)
-    config = simulated_config(system, registration_overrides(injected), seed=number + 1)
+    injected, config = realisation_config(system, number)
     with System.from_config(config) as bench:
         run = bench.run(docrime_run(bench, frames=frames))
         model = bench.model(run.result.grid)
@@ -117,10 +116,7 @@ def table(system: str, realisations: int, frames: int, only: str = "") -> Iterat
 
 def main() -> None:
     """Parse, measure, print."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--system", default="razor-shwfs")
+    parser = study_parser(__doc__, "razor-shwfs")
     parser.add_argument("--realisations", type=int, default=8)
     parser.add_argument("--frames", type=int, default=1000)
     parser.add_argument("--only", default="", help="part of the names of the variants to try")

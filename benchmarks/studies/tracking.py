@@ -26,6 +26,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
+from realisation_tables import append_line, read_lines, study_parser
 
 from escape_hw.api.procedure import Progress
 from escape_hw.api.registration import PARAMETERS, Registration
@@ -42,6 +43,7 @@ from escape_hw.pipeline.psf.strehl import strehl
 from escape_hw.report.figures import style
 from escape_hw.runtime.session.system import System, open_system
 from escape_sim.devices.bench import SimBench
+from escape_sim.devices.true_optical_gains import get_simulated_bench
 
 #: Seconds of tracking that are not judged.
 SETTLED_S = 10.0
@@ -54,9 +56,7 @@ LABELS = {"knows": "knows the truth, no pokes", "never": "never looks, no pokes"
 
 def read_comparison(out: Path, loop: str) -> NDArray[np.float64]:
     """Looks at another loop so far ``(n, 3)``: end in seconds, Strehl ratio, its error."""
-    path = out / f"{loop}.jsonl"
-    lines = path.read_text().splitlines() if path.exists() else []
-    return np.array(sorted(json.loads(line) for line in lines)).reshape(-1, 3)
+    return np.array(sorted(read_lines(out / f"{loop}.jsonl"))).reshape(-1, 3)
 
 
 def draw(out: Path, figure: Path) -> None:
@@ -227,14 +227,6 @@ def load_or_make_start(options: argparse.Namespace) -> tuple[CalibrationResult, 
     return load_matrix(matrix).result, np.load(image)
 
 
-def twin_of(bench: System) -> SimBench:
-    """The simulated bench behind a system."""
-    twin = getattr(bench.dm, "twin", None)
-    if not isinstance(twin, SimBench):
-        raise SystemExit(f"{bench.config.system.name} has no twin with a truth to look at")
-    return twin
-
-
 class WavefrontRms:
     """Keeps the rms of the wavefront in front of the sensor, mirror included, of every moment it is seen."""
 
@@ -311,7 +303,7 @@ def run_tracker(options: argparse.Namespace) -> None:
     """Run the tracker and write what it said beside the truth."""
     result, psf = load_or_make_start(options)
     with open_bench(options) as bench:
-        twin = twin_of(bench)
+        twin = get_simulated_bench(bench)
         origin = twin.now_s
         ripples = WavefrontRms(twin)
         frozen = WavefrontSampler(
@@ -351,8 +343,7 @@ class ProgressLog:
         if progress.stage != "tracking" or progress.done == self._last or not progress.metrics:
             return
         self._last = progress.done
-        with self._path.open("a") as lines:
-            lines.write(json.dumps({"second": progress.done, **progress.metrics}) + "\n")
+        append_line(self._path, {"second": progress.done, **progress.metrics})
         if progress.done % 20 == 0:
             print(f"{progress.done} of {progress.total} s", flush=True)
 
@@ -363,7 +354,7 @@ def measure_strehl(
     """Strehl ratio of a loop closed for a few seconds at a moment of the twin's clock; 0 where it is lost."""
     prepare_sensor(bench)
     bench.dm.flatten()
-    twin_of(bench).advance_to(at_s - CLOSING_S)
+    get_simulated_bench(bench).advance_to(at_s - CLOSING_S)
     control = build_integrator(bench, matrix, result.grid)
     loop = RunningLoop(bench, matrix.m2c, build_slope_function(bench, result.grid), control, science=True)
     rate = bench.wfs.settings.frame_rate_hz
@@ -389,7 +380,7 @@ def compare(options: argparse.Namespace) -> None:
     gains = np.array(tracked["gains"])
     done = read_comparison(options.out, options.loop)
     with open_bench(options) as bench:
-        twin = twin_of(bench)
+        twin = get_simulated_bench(bench)
         for end in comparison_times(tracked, options.looks):
             if any(abs(end - one[0]) < COMPARISON_S for one in done):
                 continue
@@ -399,8 +390,7 @@ def compare(options: argparse.Namespace) -> None:
                 data = gain * matrix_at(bench, result, twin.flexure.at(at + COMPARISON_S / 2))
                 matrix = replace(matrix, data=data.astype(np.float32))
             one = [float(end), *measure_strehl(bench, result, psf, at, matrix)]
-            with (options.out / f"{options.loop}.jsonl").open("a") as lines:
-                lines.write(json.dumps(one) + "\n")
+            append_line(options.out / f"{options.loop}.jsonl", one)
             print(options.loop, *(f"{value:.4f}" for value in one), flush=True)
 
 
@@ -415,11 +405,8 @@ def comparison_times(tracked: dict[str, Any], looks: int) -> NDArray[np.float64]
 
 def main() -> None:
     """Parse, and do one of the three."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = study_parser(__doc__, "razor-shwfs")
     parser.add_argument("what", choices=["track", "compare", "draw"])
-    parser.add_argument("--system", default="razor-shwfs")
     parser.add_argument("--seconds", type=float, default=600.0)
     parser.add_argument(
         "--drift", type=float, default=20.0, help="shift x over the run, %% of a sub-aperture"
@@ -433,7 +420,6 @@ def main() -> None:
     parser.add_argument("--loop", choices=["knows", "never"], default="knows", help="what compare closes")
     parser.add_argument("--seed", type=int, default=5)
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
-    parser.add_argument("--out", type=Path, default=Path("."))
     parser.add_argument("--figure", type=Path, default=Path("tracking.png"))
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)

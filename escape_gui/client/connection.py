@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import logging
+import os
 import queue
 import signal
 import subprocess
-import sys
 import tempfile
 import threading
 import time
@@ -19,7 +19,8 @@ from escape_hw.errors import EscapeError
 from escape_hw.remote.address import find_server
 from escape_hw.remote.client import Connection, connect
 from escape_hw.remote.source import Sample
-from escape_hw.remote.state import Arguments, Geometry, LogLine, ProcedureEntry, ProcedurePlan, State
+from escape_hw.remote.state import Geometry, LogLine, ProcedureEntry, State
+from escape_hw.supervision import ChildProcess
 
 log = logging.getLogger(__name__)
 #: Period of the thread for a local and a remote server, interval between connection attempts, and time for
@@ -73,14 +74,9 @@ class LiveSource:
         """Available procedures; empty until they were fetched."""
         return self._procedures
 
-    def plan(self, procedure: str, arguments: Arguments) -> ProcedurePlan:
-        """Check the arguments of a procedure; blocks until the server answers."""
-        return self.connection.plan(procedure, arguments)
-
     def fetch(self) -> None:
         """Make the slow requests; called by the thread of :class:`ServerAttachment`."""
-        geometry = self.connection.geometry()
-        if geometry != self._geometry:
+        if (geometry := self.connection.geometry()) != self._geometry:
             self._geometry = geometry
         if not self._procedures:
             self._procedures = tuple(self.connection.procedures())
@@ -188,7 +184,6 @@ class ServerAttachment(QObject):
             log.warning("a connection could not be closed: %s", error)
 
 
-_SERVE_COMMAND = (sys.executable, "-c", "from escape_hw.cli import main; main()", "serve")
 #: Time for a server to flatten the mirror and exit, seconds.
 _EXIT_TIMEOUT_S = 20.0
 _MAX_ERROR_LINES = 6
@@ -204,26 +199,24 @@ class LocalServer:
     def __init__(self, system: str) -> None:
         # Closed by :meth:`terminate`, after the process has ended.
         self._stderr: IO[str] = tempfile.TemporaryFile("w+", encoding="utf-8")  # noqa: SIM115
-        self.process = subprocess.Popen(
-            [*_SERVE_COMMAND, system, "--mode", "sim", "--quiet"],
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-            stderr=self._stderr,
-            start_new_session=True,
-        )
+        self.process = ChildProcess(
+            "escape_hw.cli", "serve", system, "--mode", "sim", "--quiet",
+            stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=self._stderr,
+        )  # fmt: skip
 
     @property
     def exit_message(self) -> str:
         """Last lines on standard error of a process that has ended; empty while it runs."""
-        if self.process.poll() is None:
+        code = self.process.wait(0)
+        if code is None:
             return ""
         self._stderr.seek(0)
         lines = self._stderr.read().strip().splitlines()[-_MAX_ERROR_LINES:]
-        return "\n".join(lines) or f"server exited with code {self.process.returncode}"
+        return "\n".join(lines) or f"server exited with code {code}"
 
     def terminate(self, connection: Connection | None) -> None:
         """Shut the server down, by a signal (SIGINT) if there is no connection, and wait for it."""
-        if self.process.poll() is None:
+        if self.process.running:
             try:
                 if connection is None:
                     raise EscapeError("not connected")
@@ -231,13 +224,7 @@ class LocalServer:
                 connection.shutdown()
             except EscapeError as error:
                 log.info("shutdown request failed (%s); sending SIGINT to the server", error)
-                self.process.send_signal(signal.SIGINT)
-            try:
-                self.process.wait(_EXIT_TIMEOUT_S)
-            except subprocess.TimeoutExpired:
-                log.warning(
-                    "server %d did not exit within %g s; leaving it running",
-                    self.process.pid,
-                    _EXIT_TIMEOUT_S,
-                )
+                os.kill(self.process.pid, signal.SIGINT)
+            if self.process.wait(_EXIT_TIMEOUT_S) is None:
+                log.warning("server %d has not exited after %g s", self.process.pid, _EXIT_TIMEOUT_S)
         self._stderr.close()

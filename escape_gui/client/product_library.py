@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import threading
 from collections.abc import Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -33,44 +32,34 @@ class LoadedProducts:
     #: By label; matrices in the order of ``_METHOD_ORDER``.
     matrices: dict[str, InteractionMatrix] = field(default_factory=dict)
     gains: dict[str, GainCurve] = field(default_factory=dict)
-    #: Reason by name of a product that could not be read.
-    errors: dict[str, str] = field(default_factory=dict)
 
 
 class ProductLibrary:
-    """Reads each product once in a worker thread and provides the results as :class:`LoadedProducts`."""
+    """Reads each product once in a worker thread; all methods belong to the window's thread."""
 
     def __init__(self) -> None:
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="escape-library")
-        self._futures: dict[tuple[str, str, int], Future[RunContent]] = {}
+        self._futures: dict[tuple[str, str, int], Future[RunContent | None]] = {}
         self._collected_keys: tuple[object, ...] = ()
         self._loaded = LoadedProducts()
-        self._lock = threading.Lock()
 
     def request(self, products: Iterable[ProductEntry]) -> None:
         """Start to read these matrices and gains, and drop others; returns at once."""
         known = {_key(one): one for one in products if one.kind in ("matrix", "gains")}
-        with self._lock:
-            for key in [key for key in self._futures if key not in known]:
-                del self._futures[key]
-            for key, one in known.items():
-                if key not in self._futures:
-                    self._futures[key] = self._pool.submit(_read, Path(one.path))
-
-    @property
-    def is_reading(self) -> bool:
-        with self._lock:
-            return any(not one.done() for one in self._futures.values())
+        for key in self._futures.keys() - known.keys():
+            del self._futures[key]
+        for key, one in known.items():
+            if key not in self._futures:
+                self._futures[key] = self._pool.submit(_read, Path(one.path))
 
     @property
     def loaded(self) -> LoadedProducts:
         """The products read so far; the same object until another one is ready."""
-        with self._lock:
-            ready = {key: one for key, one in self._futures.items() if one.done()}
-            if tuple(ready) != self._collected_keys:
-                self._collected_keys = tuple(ready)
-                self._loaded = _collect(ready)
-            return self._loaded
+        ready = {key: one for key, one in self._futures.items() if one.done()}
+        if tuple(ready) != self._collected_keys:
+            self._collected_keys = tuple(ready)
+            self._loaded = _collect(ready)
+        return self._loaded
 
     def close(self) -> None:
         self._pool.shutdown(wait=True, cancel_futures=True)
@@ -85,27 +74,25 @@ def _key(product: ProductEntry) -> tuple[str, str, int]:
     return product.name, product.path, age
 
 
-def _read(path: Path) -> RunContent:
+def _read(path: Path) -> RunContent | None:
+    """Content of a product; ``None`` when it cannot be read, which is logged."""
     # Imported here: it takes half a second, and the window appears before.
     from escape_hw.report.content import read_product
 
-    return read_product(path)
+    try:
+        return read_product(path)
+    except Exception as error:
+        log.error("cannot read %s: %s", path, error, exc_info=not isinstance(error, EscapeError))
+        return None
 
 
-def _collect(ready: dict[tuple[str, str, int], Future[RunContent]]) -> LoadedProducts:
+def _collect(ready: dict[tuple[str, str, int], Future[RunContent | None]]) -> LoadedProducts:
     matrices: dict[str, InteractionMatrix] = {}
     gains: dict[str, GainCurve] = {}
-    errors: dict[str, str] = {}
-    for (name, path, _), future in ready.items():
-        error = future.exception()
-        if isinstance(error, EscapeError):
-            errors[name] = str(error)
-            continue
-        if error is not None:
-            log.error("cannot read %s", path, exc_info=error)
-            errors[name] = f"{path}: {error}"
-            continue
+    for (name, _, _), future in ready.items():
         run = future.result()
+        if run is None:
+            continue
         for label, matrix in run.matrices().items():
             _add_unique(matrices, label, name, matrix)
         for label, result in run.gains.items():
@@ -115,7 +102,7 @@ def _collect(ready: dict[tuple[str, str, int], Future[RunContent]]) -> LoadedPro
             gains |= {other: GainCurve.of(other, one) for other, one in result.comparisons.items()}
     rank = {method: k for k, method in enumerate(_METHOD_ORDER)}
     ordered = dict(sorted(matrices.items(), key=lambda item: rank.get(item[1].method, len(rank))))
-    return LoadedProducts(ordered, gains, errors)
+    return LoadedProducts(ordered, gains)
 
 
 def _add_unique(

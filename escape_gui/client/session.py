@@ -15,34 +15,63 @@ from escape_gui.client.product_library import ProductLibrary
 from escape_hw.errors import EscapeError
 from escape_hw.remote.client import Connection
 from escape_hw.remote.source import DataSource, Sample
-from escape_hw.remote.state import Arguments, Geometry, LogLine, ProcedureEntry, ProcedurePlan, State
+from escape_hw.remote.state import Geometry, LogLine, ProcedureEntry, State
 
 log = logging.getLogger(__name__)
 T = TypeVar("T")
 
 
-class RequestSender(QObject):
-    """Sends requests from worker threads and delivers the answers in the window's thread.
+class EmptySource:
+    """Source without data, shown before a window is connected."""
 
-    Safety requests have a thread of their own, so that none waits for a slow request.
+    connected = False
+    state = State()
+    _geometry = Geometry()
+
+    def latest(self, stream: str, after: int = -1) -> Sample | None:
+        return None
+
+    def geometry(self) -> Geometry:
+        return self._geometry
+
+    def log_after(self, number: int) -> Sequence[LogLine]:
+        return ()
+
+    def procedures(self) -> Sequence[ProcedureEntry]:
+        return ()
+
+
+class Session(QObject):
+    """Data source of a window and sender of its requests; both change when another source is opened.
+
+    Worker threads send the requests, and the answers are delivered in the window's thread. Safety requests
+    have a thread of their own, so that none waits for a slow request.
     """
 
-    #: Name of the request, and why it failed.
+    #: The source was replaced; panels clear their content.
+    changed = Signal()
+    #: Name of a request, and why it failed.
     failed = Signal(str, str)
     #: Number of requests without an answer.
     pending_changed = Signal(int)
     _delivered = Signal(object)
 
-    def __init__(self, control: Connection) -> None:
+    def __init__(self) -> None:
         super().__init__()
-        self.control = control
-        self._executors = {
-            urgent: ThreadPoolExecutor(1, f"escape-gui-{'safety' if urgent else 'request'}")
-            for urgent in (False, True)
-        }
+        self.source: DataSource = EmptySource()
+        #: Receives the requests; ``None`` in replay and before a connection.
+        self.control: Connection | None = None
+        #: Products listed by the source, loaded for the panels.
+        self.library = ProductLibrary()
+        self._executors: dict[bool, ThreadPoolExecutor] = {}
         self._pending = 0
-        self._accepting = True
         self._delivered.connect(lambda deliver: deliver(), Qt.ConnectionType.QueuedConnection)
+
+    def set_source(self, source: DataSource, control: Connection | None) -> None:
+        """Replace the source; without ``control`` no requests can be sent."""
+        self._close_requests()
+        self.source, self.control = source, control
+        self.changed.emit()
 
     def ask(
         self,
@@ -54,7 +83,7 @@ class RequestSender(QObject):
         urgent: bool = False,
         quiet: bool = False,
     ) -> None:
-        """Send a request; returns at once.
+        """Send a request; returns at once, and does nothing without a server.
 
         Parameters
         ----------
@@ -69,13 +98,14 @@ class RequestSender(QObject):
         quiet
             Do not emit :attr:`failed`: ``on_error`` reports the failure.
         """
-        if not self._accepting:
+        control = self.control
+        if control is None:
             return
 
         def deliver(future: Future[T]) -> None:
-            if not self._accepting:
+            if self.control is not control:
                 return
-            self._change_pending(-1)
+            self._set_pending(self._pending - 1)
             error = future.exception()
             if error is None:
                 if on_result is not None:
@@ -89,73 +119,15 @@ class RequestSender(QObject):
             if on_error is not None:
                 on_error(reason)
 
-        self._change_pending(+1)
-        future = self._executors[urgent].submit(call, self.control)
+        self._set_pending(self._pending + 1)
+        if urgent not in self._executors:
+            self._executors[urgent] = ThreadPoolExecutor(1, f"escape-gui-{'safety' if urgent else 'request'}")
+        future = self._executors[urgent].submit(call, control)
         future.add_done_callback(lambda answer: self._delivered.emit(partial(deliver, answer)))
 
-    def _change_pending(self, step: int) -> None:
-        self._pending += step
-        self.pending_changed.emit(self._pending)
-
-    def close(self) -> None:
-        """Stop the threads; answers that still arrive are discarded."""
-        self._accepting = False
-        for worker in self._executors.values():
-            worker.shutdown(wait=True, cancel_futures=True)
-
-
-class EmptySource:
-    """Source without data, shown before a window is connected."""
-
-    connected = False
-    state = State()
-
-    def latest(self, stream: str, after: int = -1) -> Sample | None:
-        return None
-
-    def geometry(self) -> Geometry:
-        return Geometry()
-
-    def log_after(self, number: int) -> Sequence[LogLine]:
-        return ()
-
-    def procedures(self) -> Sequence[ProcedureEntry]:
-        return ()
-
-    def plan(self, procedure: str, arguments: Arguments) -> ProcedurePlan:
-        raise EscapeError("not connected to a server")
-
-
-class Session(QObject):
-    """Data source of a window and sender of its requests; both change when another source is opened."""
-
-    #: The source was replaced; panels clear their content.
-    changed = Signal()
-    failed = Signal(str, str)
-    pending_changed = Signal(int)
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.source: DataSource = EmptySource()
-        #: ``None`` in replay and before a connection.
-        self.requests: RequestSender | None = None
-        #: Products listed by the source, loaded for the panels.
-        self.library = ProductLibrary()
-
-    def set_source(self, source: DataSource, control: Connection | None) -> None:
-        """Replace the source; without ``control`` no requests can be sent."""
-        self._close_requests()
-        self.source = source
-        if control is not None:
-            self.requests = RequestSender(control)
-            self.requests.failed.connect(self.failed)
-            self.requests.pending_changed.connect(self.pending_changed)
-        self.changed.emit()
-
-    def ask(self, what: str, call: Callable[[Connection], object], *, urgent: bool = False) -> None:
-        """Send a request without waiting for its result; does nothing without a server."""
-        if self.requests is not None:
-            self.requests.ask(what, call, urgent=urgent)
+    def _set_pending(self, number: int) -> None:
+        self._pending = number
+        self.pending_changed.emit(number)
 
     def toggle_pause(self) -> None:
         """Request to pause the running procedure, or to resume it if it is paused."""
@@ -172,15 +144,13 @@ class Session(QObject):
     @property
     def live(self) -> bool:
         """Whether the source is, or will be, a server rather than a recorded run."""
-        return self.requests is not None or isinstance(self.source, EmptySource)
+        return self.control is not None or isinstance(self.source, EmptySource)
 
     @property
     def may_write(self) -> bool:
         """Whether this client holds the lease."""
         lease = self.source.state.lease
-        return (
-            self.requests is not None and lease is not None and lease.client == self.requests.control.client
-        )
+        return self.control is not None and lease is not None and lease.client == self.control.client
 
     @property
     def request_context(self) -> RequestContext:
@@ -193,7 +163,10 @@ class Session(QObject):
         self.source = EmptySource()
 
     def _close_requests(self) -> None:
-        if self.requests is not None:
-            self.requests.close()
-            self.requests.deleteLater()
-            self.requests = None
+        """Stop the threads; answers that still arrive are discarded."""
+        self.control = None
+        for worker in self._executors.values():
+            worker.shutdown(wait=True, cancel_futures=True)
+        self._executors.clear()
+        if self._pending:
+            self._set_pending(0)

@@ -17,7 +17,7 @@ from escape_gui.panels.psf import PsfPanel
 from escape_gui.panels.sprint import SprintPanel
 
 #: All panels, in the order of the View menu and of F6. A new panel is added here and in
-#: :data:`escape_gui.window.workspaces.WORKSPACES`.
+#: :data:`escape_gui.window.docks.WORKSPACES`.
 PANELS: tuple[type[Panel], ...] = (
     DevicesPanel, CameraPanel, MirrorPanel, ProcedurePanel, ModesPanel, SprintPanel, GainsPanel, LoopPanel,
     PerformancePanel, PsfPanel, LatencyPanel, LogPanel,

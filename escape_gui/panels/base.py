@@ -13,7 +13,7 @@ from PySide6.QtWidgets import QLabel, QStackedLayout, QVBoxLayout, QWidget
 from escape_gui.client.session import Session
 from escape_gui.theme import Theme
 from escape_hw.remote.source import DataSource, Sample
-from escape_hw.remote.state import DeviceHealth, Phase, State
+from escape_hw.remote.state import DeviceHealth, Geometry, Phase, State
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -95,6 +95,8 @@ class Panel(QWidget):
         self._state_serial = self._engine_pid = -1
         self._last_sample_s = 0.0
         self.health = DeviceHealth.STALE
+        #: Positions of the sub-apertures and actuators; empty before the sensor was measured.
+        self.bench_geometry = Geometry()
         #: Set by subclasses: :meth:`redraw` is called at the end of the refresh.
         self.dirty = False
         self.show_placeholder(bool(self.placeholder))
@@ -118,6 +120,10 @@ class Panel(QWidget):
                 self._last_sample_s = time.monotonic()
                 self.show_placeholder(False)
                 self.on_sample(stream, sample)
+        geometry = source.geometry()
+        if geometry is not self.bench_geometry:
+            self.bench_geometry = geometry
+            self.on_geometry()
         self.tick(source)
         if self.dirty:
             self.dirty = False
@@ -140,6 +146,8 @@ class Panel(QWidget):
         self._last_index.clear()
         self._state_serial = self._engine_pid = -1
         self._last_sample_s = 0.0
+        self.bench_geometry = Geometry()
+        self.on_geometry()
         self.clear()
         self.show_placeholder(bool(self.placeholder))
 
@@ -163,8 +171,11 @@ class Panel(QWidget):
     def on_sample(self, stream: str, sample: Sample) -> None:
         """Process a new entry of a stream."""
 
+    def on_geometry(self) -> None:
+        """Process a new :attr:`bench_geometry`."""
+
     def tick(self, source: DataSource) -> None:
-        """Process everything else, such as geometry and log; called at each refresh, after the samples."""
+        """Process everything else, such as the log; called at each refresh, after the samples."""
 
     def redraw(self) -> None:
         """Draw data that have changed, see :attr:`dirty`."""

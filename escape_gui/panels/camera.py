@@ -14,13 +14,18 @@ from PySide6.QtWidgets import QLabel, QToolButton
 from escape_gui.client.availability import UNKNOWN_VALUE, has_frames
 from escape_gui.panels.base import Context, ExportArray, Panel
 from escape_gui.views.images import mask_from_rows, slope_map_pair
-from escape_gui.widgets.controls.buttons import SegmentedButton
-from escape_gui.widgets.images.image_viewer import DIVERGING_MAPS, SEQUENTIAL_MAPS, ImageToolbar, ImageViewer
-from escape_gui.widgets.images.quiver import Quiver, outline_points
-from escape_gui.widgets.layouts import row
-from escape_gui.widgets.plots.plot import Plot
-from escape_hw.remote.source import DataSource, Sample
-from escape_hw.remote.state import Geometry, State
+from escape_gui.widgets.controls import SegmentedButton, row
+from escape_gui.widgets.images import (
+    DIVERGING_MAPS,
+    SEQUENTIAL_MAPS,
+    ImageToolbar,
+    ImageViewer,
+    Quiver,
+    outline_points,
+)
+from escape_gui.widgets.plots import Plot
+from escape_hw.remote.source import Sample
+from escape_hw.remote.state import State
 
 RAW, ARROWS, MAPS, DIFFERENCE = "raw", "arrows", "x | y", "difference"
 _TIPS = (
@@ -81,7 +86,6 @@ class CameraPanel(Panel):
         self._frame: NDArray[Any] | None = None
         self._reference: NDArray[Any] | None = None
         self._slopes: NDArray[Any] | None = None
-        self._geometry = Geometry()
         self._valid = np.zeros((0, 0), bool)
         self._full_scale: float | None = None
         self._histogram_due = 0.0
@@ -89,16 +93,10 @@ class CameraPanel(Panel):
         self.apply_theme()
 
     # ------------------------------------------------------------ data
-    def tick(self, source: DataSource) -> None:
-        geometry = source.geometry()
-        if geometry is not self._geometry:
-            self._set_geometry(geometry)
-
-    def _set_geometry(self, geometry: Geometry) -> None:
-        self._geometry = geometry
-        self._valid = mask_from_rows(geometry.valid)
-        self._outlines.setData(*outline_points(geometry.outlines_px), connect="finite")
-        self.quiver.set_geometry(geometry)
+    def on_geometry(self) -> None:
+        self._valid = mask_from_rows(self.bench_geometry.valid)
+        self._outlines.setData(*outline_points(self.bench_geometry.outlines_px), connect="finite")
+        self.quiver.set_geometry(self.bench_geometry)
 
     def on_state(self, state: State) -> None:
         light = state.illumination
@@ -113,8 +111,8 @@ class CameraPanel(Panel):
             self._show_slopes()
             return
         self._frame = sample.data
-        top = sample.meta.get("top")
-        self._full_scale = float(top) if top is not None else None
+        full_scale = sample.meta.get("full_scale")
+        self._full_scale = float(full_scale) if full_scale is not None else None
         self._show_frame()
 
     def _show_frame(self) -> None:
@@ -177,7 +175,6 @@ class CameraPanel(Panel):
 
     def clear(self) -> None:
         self._frame = self._reference = self._slopes = None
-        self._set_geometry(Geometry())
         self.image_view.clear()
         self.signed.clear()
 

@@ -7,8 +7,7 @@ from typing import ClassVar
 from PySide6.QtWidgets import QFrame, QLabel, QVBoxLayout, QWidget
 
 from escape_gui.panels.base import Context, Panel
-from escape_gui.widgets.controls.status_indicator import HEALTH_LEVELS, StatusIndicator
-from escape_gui.widgets.layouts import column, row, scroll_area, text_label
+from escape_gui.widgets.controls import HEALTH_LEVELS, StatusIndicator, column, row, scroll_area, text_label
 from escape_hw.remote.state import DeviceState, State
 
 #: Titles of the keys of ``[devices]``.
@@ -77,8 +76,7 @@ class _DeviceRow(QFrame):
         self._model.setObjectName("caption")
         head = row(self._name, None, self._indicator)
         column(head, self._model, self._facts, parent=self, spacing=0).setContentsMargins(4, 4, 4, 4)
-        context.theme.changed.connect(self._apply_theme)
-        self._apply_theme()
+        context.theme.follow(self._apply_theme)
 
     def show_device(self, device: DeviceState) -> None:
         role = ROLES.get(device.name, device.name)

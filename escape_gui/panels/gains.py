@@ -11,9 +11,8 @@ from PySide6.QtWidgets import QCheckBox
 from escape_gui.client.product_library import LoadedProducts
 from escape_gui.panels.base import Context, ExportArray, Panel
 from escape_gui.views.gain_curves import GainCurve, live_curve
-from escape_gui.widgets.layouts import row, text_label
-from escape_gui.widgets.plots.gains import GainsPlot
-from escape_gui.widgets.plots.plot import MARKERS
+from escape_gui.widgets.controls import row, text_label
+from escape_gui.widgets.plots import MARKERS, GainsPlot
 from escape_hw.remote.source import DataSource, Sample
 from escape_hw.remote.state import State
 from escape_hw.report.tables import METHOD_LABELS

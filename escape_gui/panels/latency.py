@@ -8,9 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from escape_gui.panels.base import Context, ExportArray, Panel
-from escape_gui.widgets.controls.readout import Readout, readout_grid
-from escape_gui.widgets.layouts import row
-from escape_gui.widgets.plots.plot import Plot
+from escape_gui.widgets.controls import Readout, readout_grid, row
+from escape_gui.widgets.plots import Plot
 from escape_hw.remote.source import Sample
 from escape_hw.remote.state import State
 from escape_hw.streams.timing import MIDDLES, percentiles_of

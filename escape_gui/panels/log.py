@@ -10,7 +10,7 @@ from PySide6.QtGui import QGuiApplication
 from PySide6.QtWidgets import QComboBox, QLineEdit, QPlainTextEdit, QPushButton
 
 from escape_gui.panels.base import Context, Panel
-from escape_gui.widgets.layouts import row
+from escape_gui.widgets.controls import row
 from escape_hw.remote.source import DataSource
 from escape_hw.remote.state import LogLine
 

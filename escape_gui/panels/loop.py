@@ -8,12 +8,18 @@ from typing import ClassVar
 from PySide6.QtCore import Qt
 from PySide6.QtWidgets import QComboBox, QDoubleSpinBox, QGridLayout, QLabel, QPushButton, QSpinBox
 
-from escape_gui.client.availability import is_measured, reason_no_write, tooltip
+from escape_gui.client.availability import is_measured, reason_no_write
 from escape_gui.panels.base import Context, Panel
 from escape_gui.views.loop_form import FIELDS, LoopSettingsEdit
-from escape_gui.widgets.controls.buttons import HoldButton
-from escape_gui.widgets.controls.status_indicator import Level, StatusIndicator
-from escape_gui.widgets.layouts import caption, row, text_label
+from escape_gui.widgets.controls import (
+    HoldButton,
+    Level,
+    StatusIndicator,
+    caption,
+    row,
+    set_available,
+    text_label,
+)
 from escape_hw.config.system import MAX_GAIN
 from escape_hw.remote.client import Connection
 from escape_hw.remote.source import DataSource
@@ -144,7 +150,7 @@ class LoopPanel(Panel):
         now = self.context.session.request_context
         reason = reason_no_write(now)
         not_checked = "" if self._checked_edit else "press Check first"
-        _set_available(self.apply_button, "Change the loop now.", reason or not_checked)
+        set_available(self.apply_button, "Change the loop now.", reason or not_checked)
         if self._loop.closed:
             obstacle = "the loop is closed"
         elif not self._matrices:
@@ -153,7 +159,7 @@ class LoopPanel(Panel):
             obstacle = f"{now.state.active_run.name} is running"
         else:
             obstacle = ""
-        _set_available(self.close_button, "Close the loop with the setpoints.", reason or obstacle)
+        set_available(self.close_button, "Close the loop with the setpoints.", reason or obstacle)
 
     # ------------------------------------------------------------ edit, check, apply
     @property
@@ -203,9 +209,9 @@ class LoopPanel(Panel):
         )
 
     def _ask(self, what: str, call: Callable[[Connection], object]) -> None:
-        if self.context.session.requests is not None:
+        if self.context.session.control is not None:
             self.message.setText("Waiting for the server…")
-            self.context.session.requests.ask(what, call, self._on_done, self._on_refused)
+            self.context.session.ask(what, call, self._on_done, self._on_refused)
 
     def _on_done(self, _: object) -> None:
         self.clear()
@@ -237,8 +243,3 @@ def _spin_box(low: float, high: float, step: float, digits: int) -> QDoubleSpinB
     spin.setDecimals(digits)
     spin.setKeyboardTracking(False)
     return spin
-
-
-def _set_available(button: QPushButton, tip: str, reason: str) -> None:
-    button.setEnabled(not reason)
-    button.setToolTip(tooltip(tip, reason))

@@ -10,12 +10,10 @@ from numpy.typing import NDArray
 from escape_gui.client.availability import UNKNOWN_VALUE, is_measured
 from escape_gui.panels.base import Context, ExportArray, Panel
 from escape_gui.views.images import ActuatorImage
-from escape_gui.widgets.controls.buttons import SegmentedButton
-from escape_gui.widgets.controls.readout import Readout, readout_grid
-from escape_gui.widgets.images.image_viewer import DIVERGING_MAPS, ImageToolbar, ImageViewer
-from escape_gui.widgets.layouts import caption, row
-from escape_hw.remote.source import DataSource, Sample
-from escape_hw.remote.state import Geometry, State
+from escape_gui.widgets.controls import Readout, SegmentedButton, caption, readout_grid, row
+from escape_gui.widgets.images import DIVERGING_MAPS, ImageToolbar, ImageViewer
+from escape_hw.remote.source import Sample
+from escape_hw.remote.state import State
 
 COMMAND, MEASURED = "command", "measured"
 
@@ -58,20 +56,14 @@ class MirrorPanel(Panel):
         self.body.addWidget(ImageToolbar(theme, self.image_view, logarithmic=False))
         self.body.addLayout(readout_grid(self.readouts))
         self._values: dict[str, NDArray[Any]] = {}
-        self._set_geometry(Geometry())
+        self._map = ActuatorImage(self.bench_geometry)
         self._update_measured_button()
         self.apply_theme()
 
-    def tick(self, source: DataSource) -> None:
-        geometry = source.geometry()
-        if geometry is not self._geometry:
-            self._set_geometry(geometry)
-            self._update_image()
-
-    def _set_geometry(self, geometry: Geometry) -> None:
-        self._geometry = geometry
-        self._map = ActuatorImage(geometry)
+    def on_geometry(self) -> None:
+        self._map = ActuatorImage(self.bench_geometry)
         self.image_view.clear()
+        self._update_image()
 
     def on_state(self, state: State) -> None:
         mirror = state.mirror
@@ -110,7 +102,7 @@ class MirrorPanel(Panel):
 
     def clear(self) -> None:
         self._values.clear()
-        self._set_geometry(Geometry())
+        self.image_view.clear()
         self.choice.choose(COMMAND)
         self._update_measured_button()
 

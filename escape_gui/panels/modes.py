@@ -12,12 +12,9 @@ from PySide6.QtWidgets import QCheckBox, QComboBox, QLabel, QPushButton, QSizePo
 
 from escape_gui.client.product_library import LoadedProducts
 from escape_gui.panels.base import Context, ExportArray, Panel
-from escape_gui.views.mode_detail import tiles
-from escape_gui.views.mode_mosaic import LIMIT
-from escape_gui.widgets.images.colour_scale import DIVERGING, ColourScale
-from escape_gui.widgets.images.map_tiles import MapTiles
-from escape_gui.widgets.images.mode_mosaic import ModeMosaic, MosaicPixel
-from escape_gui.widgets.layouts import row
+from escape_gui.views.mode_maps import LIMIT, tiles
+from escape_gui.widgets.controls import row
+from escape_gui.widgets.mode_maps import DIVERGING, ColourScale, MapTiles, ModeMosaic, MosaicPixel
 from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.remote.source import DataSource, Sample
 from escape_hw.remote.state import State

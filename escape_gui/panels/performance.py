@@ -9,9 +9,8 @@ import numpy as np
 
 from escape_gui.panels.base import Context, ExportArray, Panel
 from escape_gui.panels.psf import NO_REFERENCE, NO_REFERENCE_TIP
-from escape_gui.widgets.controls.readout import Readout
-from escape_gui.widgets.layouts import caption, row
-from escape_gui.widgets.plots.plot import StripChart, TimeSeriesBuffer
+from escape_gui.widgets.controls import Readout, caption, row
+from escape_gui.widgets.plots import StripChart, TimeSeriesBuffer
 from escape_hw.remote.source import DataSource
 from escape_hw.remote.state import State
 

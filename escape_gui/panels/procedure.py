@@ -16,13 +16,12 @@ from escape_gui.client.availability import (
     reason_no_pause,
     reason_no_request,
     reason_no_write,
-    tooltip,
 )
 from escape_gui.panels.base import Context, Panel
 from escape_gui.views import procedure_form as form_text
-from escape_gui.views.mode_mosaic import ModeStatistics
-from escape_gui.widgets.controls.argument_form import ArgumentForm
-from escape_gui.widgets.layouts import row, scroll_area, text_label
+from escape_gui.views.mode_maps import ModeStatistics
+from escape_gui.widgets.argument_form import ArgumentForm
+from escape_gui.widgets.controls import row, scroll_area, set_available, text_label
 from escape_hw.remote.source import DataSource, Sample
 from escape_hw.remote.state import Arguments, FinishedRun, ProcedureEntry, ProcedurePlan, State
 
@@ -71,7 +70,7 @@ class ProcedurePanel(Panel):
         self.choice.setAccessibleName("Procedure")
         self.choice.currentIndexChanged.connect(self._on_procedure_selected)
         self._description = text_label()
-        self.form = ArgumentForm(self.context.theme)
+        self.form = ArgumentForm()
         self.form.edited.connect(self._on_edit)
         self.plan = text_label()
         self.plan.setAccessibleName("Plan")
@@ -127,7 +126,7 @@ class ProcedurePanel(Panel):
             self._on_procedure_selected()
         self.form.setVisible(bool(self._entries))
         if not self._entries:
-            replay = source.connected and self.context.session.requests is None
+            replay = source.connected and self.context.session.control is None
             _set_text(
                 self._description, REPLAY_TEXT if replay else "" if source.connected else NO_SERVER_TEXT
             )
@@ -196,7 +195,7 @@ class ProcedurePanel(Panel):
         self._plan = None
         self._show_plan("")
         self._enable()
-        if self.chosen and self.context.session.requests is not None:
+        if self.chosen and self.context.session.control is not None:
             self._timer.start()
 
     def _show_plan(self, text: str, level: str = "muted") -> None:
@@ -210,8 +209,8 @@ class ProcedurePanel(Panel):
     # ------------------------------------------------------------ requests
     def ask_plan(self) -> None:
         """Request the plan for the arguments in the form; nothing moves."""
-        requests, name = self.context.session.requests, self.chosen
-        if requests is None or not name:
+        session, name = self.context.session, self.chosen
+        if session.control is None or not name:
             return
         try:
             arguments = self.form.arguments()
@@ -219,7 +218,7 @@ class ProcedurePanel(Panel):
             self._show_plan(f"⚠ {error}", "bad")
             return
         self._checked_arguments = arguments
-        requests.ask(
+        session.ask(
             "check the arguments",
             lambda server: server.plan(name, arguments),
             lambda plan: self._on_plan(name, arguments, plan),
@@ -236,10 +235,10 @@ class ProcedurePanel(Panel):
         self._enable()
 
     def ask_start(self) -> None:
-        requests, name, arguments = self.context.session.requests, self.chosen, self._checked_arguments
-        if requests is not None and self._plan is not None and arguments is not None:
+        session, name, arguments = self.context.session, self.chosen, self._checked_arguments
+        if session.control is not None and self._plan is not None and arguments is not None:
             self.start.setEnabled(False)
-            requests.ask(f"start {self.choice.currentText()}", lambda server: server.start(name, **arguments))
+            session.ask(f"start {self.choice.currentText()}", lambda server: server.start(name, **arguments))
 
     def _enable(self) -> None:
         now = self.context.session.request_context
@@ -251,8 +250,7 @@ class ProcedurePanel(Panel):
             (self.pause, "Pause between two steps, or resume.", reason_no_pause(now)),
             (self.abort, "Stop and save the data acquired so far.", reason_no_abort(now)),
         ):
-            button.setEnabled(not reason)
-            button.setToolTip(tooltip(tip, reason))
+            set_available(button, tip, reason)
         writable = not reason_no_request(now)
         self.form.setEnabled(writable)
         self.choice.setEnabled(writable and self.choice.count() > 0)

@@ -10,9 +10,9 @@ from PySide6.QtWidgets import QHBoxLayout, QLabel
 
 from escape_gui.panels.base import Context, ExportArray, Panel
 from escape_gui.views.images import RadialProfile
-from escape_gui.widgets.images.image_viewer import ImageToolbar, ImageViewer
-from escape_gui.widgets.layouts import caption, column
-from escape_gui.widgets.plots.plot import Plot
+from escape_gui.widgets.controls import caption, column
+from escape_gui.widgets.images import ImageToolbar, ImageViewer
+from escape_gui.widgets.plots import Plot
 from escape_hw.remote.source import Sample
 
 #: Lower limit of the profiles, relative to the peak of the reference.

@@ -11,10 +11,8 @@ from PySide6.QtWidgets import QGridLayout, QLabel, QPushButton, QTabWidget, QWid
 
 from escape_gui.panels.base import Context, ExportArray, Panel
 from escape_gui.views.convergence import NAMES, UNITS, ConvergenceHistory, RegistrationDrift, short_unit
-from escape_gui.widgets.controls.status_indicator import Level, StatusIndicator
-from escape_gui.widgets.layouts import column, row, text_label
-from escape_gui.widgets.plots.plot import MARKERS
-from escape_gui.widgets.plots.registration import ConvergencePlot, DriftPlot
+from escape_gui.widgets.controls import Level, StatusIndicator, column, row, text_label
+from escape_gui.widgets.plots import MARKERS, ConvergencePlot, DriftPlot
 from escape_hw.api.registration import PARAMETERS
 from escape_hw.api.results import Estimate
 from escape_hw.remote.source import Sample

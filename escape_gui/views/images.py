@@ -23,12 +23,7 @@ def mask_from_rows(rows: tuple[str, ...]) -> NDArray[np.bool_]:
 def slope_map_pair(slopes: NDArray[np.floating], valid: NDArray[np.bool_]) -> NDArray[np.floating]:
     """Maps of x and y side by side ``(rows, 2 * columns + MAP_GAP)``, NaN outside the pupil.
 
-    Parameters
-    ----------
-    slopes
-        All x, then all y ``(2 * n_valid,)``.
-    valid
-        Valid sub-apertures or pupil pixels ``(rows, columns)``.
+    Slopes ``(2 * n_valid,)`` are all x, then all y; ``valid`` is ``(rows, columns)``.
     """
     rows, columns = valid.shape
     maps = np.full((rows, 2 * columns + MAP_GAP), np.nan, slopes.dtype)

@@ -58,10 +58,7 @@ def format_value(value: object) -> str:
 def parse_value(parameter: ProcedureParameter, text: str) -> float | int | str | None:
     """Value of a field's text; ``None`` if an optional field is empty.
 
-    Raises
-    ------
-    ValueError
-        The text is not a number, not an integer or out of range; gives the allowed values.
+    ValueError: the text is not a number, not an integer or out of range; gives the allowed values.
     """
     text = text.strip().replace("−", "-")
     if not text or text == NO_CHOICE:
@@ -143,13 +140,7 @@ def result_line(ended: FinishedRun) -> str:
 
 
 def comparison_lines(now: Mapping[str, Any], before: Mapping[str, Any] | None) -> list[str]:
-    """What came out, beside what came out the last time.
-
-    Parameters
-    ----------
-    now, before
-        Documents of two runs (``result.json``); ``None``: there was none before.
-    """
+    """Results of a run beside those of the previous one, from their documents (``result.json``)."""
     lines = _registration_lines(now, before)
     for key, words, unit in (("gain", "Gain of the matrix", ""), ("residual_rms_nm", "Residual", " nm rms")):
         value = now.get(key)

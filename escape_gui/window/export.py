@@ -13,7 +13,7 @@ from PySide6.QtWidgets import QFileDialog, QWidget
 
 from escape_gui.client.session import Session
 from escape_gui.panels.base import ExportArray, Panel
-from escape_gui.widgets.controls.status_indicator import Level
+from escape_gui.widgets.controls import Level
 from escape_gui.window.notifications import NotificationBar
 from escape_hw.errors import EscapeError
 from escape_hw.io.provenance import Provenance

@@ -8,10 +8,7 @@ from PySide6.QtWidgets import QGridLayout, QHBoxLayout, QLabel, QPushButton, QWi
 
 from escape_gui.client.availability import UNKNOWN_VALUE, has_frames, is_measured
 from escape_gui.panels.base import Context
-from escape_gui.widgets.controls.buttons import HoldButton
-from escape_gui.widgets.controls.readout import Readout
-from escape_gui.widgets.controls.status_indicator import Level, StatusIndicator
-from escape_gui.widgets.layouts import column, row, text_label
+from escape_gui.widgets.controls import HoldButton, Level, Readout, StatusIndicator, column, row, text_label
 from escape_hw.remote.state import Phase, State
 
 PHASES: dict[Phase, Level] = {
@@ -158,6 +155,13 @@ def _safety_button(action: QAction, text: str) -> QPushButton:
     button.setObjectName("stop")
     button.setAccessibleName(text)
     button.clicked.connect(action.trigger)
+    button.setMinimumHeight(40)
+    _follow_action(button, action)
+    return button
+
+
+def _follow_action(button: QPushButton, action: QAction) -> None:
+    """Enable a button and explain it as its action."""
 
     def synchronise() -> None:
         button.setEnabled(action.isEnabled())
@@ -165,8 +169,6 @@ def _safety_button(action: QAction, text: str) -> QPushButton:
 
     action.changed.connect(synchronise)
     synchronise()
-    button.setMinimumHeight(40)
-    return button
 
 
 class FaultBanner(QWidget):
@@ -177,15 +179,11 @@ class FaultBanner(QWidget):
         indicator = StatusIndicator(context.theme)
         indicator.set_status(Level.ERROR, "FAULT")
         self._text = text_label()
-        self._button = HoldButton("clear", context.theme)
-        self._button.confirmed.connect(clear.trigger)
-        clear.changed.connect(lambda: self._sync_action(clear))
-        row(indicator, (self._text, 1), self._button, parent=self).setContentsMargins(8, 4, 8, 4)
+        button = HoldButton("clear", context.theme)
+        button.confirmed.connect(clear.trigger)
+        _follow_action(button, clear)
+        row(indicator, (self._text, 1), button, parent=self).setContentsMargins(8, 4, 8, 4)
         self.hide()
-
-    def _sync_action(self, clear: QAction) -> None:
-        self._button.setEnabled(clear.isEnabled())
-        self._button.setToolTip(clear.toolTip())
 
     def show_state(self, state: State) -> None:
         """Show the fault, or hide the row if there is none."""

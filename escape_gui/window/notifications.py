@@ -7,8 +7,7 @@ from PySide6.QtGui import QResizeEvent
 from PySide6.QtWidgets import QFrame, QLabel, QSizePolicy, QWidget
 
 from escape_gui.theme import Theme
-from escape_gui.widgets.controls.status_indicator import Level, StatusIndicator
-from escape_gui.widgets.layouts import caption, flat_button, row
+from escape_gui.widgets.controls import Level, StatusIndicator, caption, flat_button, row
 from escape_hw.remote.state import Finish, State
 
 #: Display time of a notification; errors stay until they are closed.

@@ -3,12 +3,32 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from escape_hw.api.representation import image_html, table_html
+from escape_hw.deprecation import renamed_text, warn_renamed
+
+
+class _Metrics(dict[str, Any]):
+    """Scalars by name; names of version 0.1.0 are replaced, and served with a warning."""
+
+    _RENAMED: ClassVar[dict[str, str]] = {"shortened": "clipped_pokes"}
+
+    def __init__(self, values: Any = ()) -> None:
+        super().__init__(values)
+        for old, new in self._RENAMED.items():
+            if old in self:
+                self[new] = self.pop(old)
+
+    def __missing__(self, key: str) -> Any:
+        new = self._RENAMED.get(key)
+        if new is None:
+            raise KeyError(key)
+        warn_renamed(renamed_text(f"the metric '{key}'", f"'{new}'"))
+        return self[new]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,6 +70,7 @@ class InteractionMatrix:
     slope_unit: str = "pixel"
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "metrics", _Metrics(self.metrics))
         if self.data.ndim != 2:
             raise ValueError(f"the matrix has shape {self.data.shape}; it must be (n_slopes, n_modes)")
         n_slopes, n_modes = self.data.shape

@@ -56,12 +56,13 @@ class Estimate:
         return {"value": self.value, "sigma": self.sigma, "unit": self.unit}
 
 
+@renamed_members(delay="delay_frames")
 @dataclass(frozen=True, slots=True, eq=False)
 class TemporalResponse:
     """Response of the sensor to a step of the mirror, in frames.
 
     ``weights[l]`` is the share of the final response that appears in the ``l``-th frame after the
-    command was sent; they sum to 1. ``delay`` is the mean of that distribution in frames.
+    command was sent; they sum to 1. ``delay_frames`` is the mean of that distribution.
     """
 
     weights: NDArray[np.float64]
@@ -69,7 +70,7 @@ class TemporalResponse:
     __repr__ = short_repr
 
     @property
-    def delay(self) -> float:
+    def delay_frames(self) -> float:
         """Mean delay in frames."""
         return float(np.arange(self.weights.size) @ self.weights)
 

@@ -49,7 +49,7 @@ def format_calibration(result: CalibrationResult) -> list[str]:
         f"signal-to-noise ratio per mode: minimum {snr.min():.3g}, median {sorted(snr)[len(snr) // 2]:.3g}",
     ]
     if result.response is not None:
-        lines.append(f"delay: {result.response.delay:.2f} frames")
+        lines.append(f"delay: {result.response.delay_frames:.2f} frames")
     return [*lines, *result.notes]
 
 

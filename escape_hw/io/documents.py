@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from escape_hw.api.interaction_matrix import InteractionMatrix
-from escape_hw.api.optical_gains import GainRound, GainsResult
+from escape_hw.api.optical_gains import GainRound, GainsResult, OpticalGains
 from escape_hw.api.registration import PARAMETERS, UNITS
 from escape_hw.api.results import (
     CalibrationResult,
@@ -55,13 +55,7 @@ def header_fields(
     command: str, system: str | None, simulated: bool | None, seed: int | None
 ) -> dict[str, Any]:
     """What every document begins with; ``None`` where a command concerns no system."""
-    return {
-        "schema": SCHEMA,
-        "command": command,
-        "system": system,
-        "simulated": simulated,
-        "seed": seed,
-    }
+    return {"schema": SCHEMA, "command": command, "system": system, "simulated": simulated, "seed": seed}
 
 
 def snr_document(matrix: InteractionMatrix) -> dict[str, Any]:
@@ -90,7 +84,6 @@ def registration_document(estimate: RegistrationEstimate | None) -> dict[str, An
 
 def calibration_document(result: CalibrationResult) -> dict[str, Any]:
     """A calibration in plain values; the signal-to-noise ratio is that of the measured matrix."""
-    measured = result.measured or result.matrix
     response = result.response
     return {
         "method": result.matrix.method,
@@ -100,8 +93,8 @@ def calibration_document(result: CalibrationResult) -> dict[str, Any]:
         "n_modes": result.matrix.n_modes,
         "n_sub_apertures": result.grid.n_valid,
         **registration_document(result.registration),
-        "snr": snr_document(measured),
-        "delay_frames": None if response is None else response.delay,
+        "snr": snr_document(result.measured or result.matrix),
+        "delay_frames": None if response is None else response.delay_frames,
         "response": None if response is None else {"weights": response.weights, "sigma": response.sigma},
         "partial": result.partial,
         "notes": list(result.notes),
@@ -119,19 +112,11 @@ def strehl_document(strehl: StrehlEstimate | None) -> dict[str, Any] | None:
 def loop_document(result: LoopResult) -> dict[str, Any]:
     """A closed-loop run in plain values."""
     return {
-        "method": result.method,
-        "gain": result.gain,
-        "gain_sigma": result.gain_sigma,
-        "leak": result.leak,
-        "dropped_modes": result.dropped_modes,
-        "frames": result.frames,
+        **_attributes(result, "method", "gain", "gain_sigma", "leak", "dropped_modes", "frames"),
         "strehl": strehl_document(result.strehl),
-        "residual_rms_nm": result.residual_rms_nm,
-        "rate_hz": result.rate_hz,
+        **_attributes(result, "residual_rms_nm", "rate_hz"),
         "latency_us": dict(result.latency_us),
-        "lost_frames": result.lost_frames,
-        "stable": result.stable,
-        "partial": result.partial,
+        **_attributes(result, "lost_frames", "stable", "partial"),
         "notes": list(result.notes),
     }
 
@@ -139,23 +124,16 @@ def loop_document(result: LoopResult) -> dict[str, Any]:
 def gains_document(result: GainsResult) -> dict[str, Any]:
     """A bootstrap of optical gains in plain values; ``optical_gain`` is what to scale a matrix by."""
     gains = result.gains
+    no_gains = {"optical_gain": None, "sigma": None, "common_sigma": None}
     return {
         "method": result.method,
-        "optical_gain": None if gains is None else gains.best,
-        "sigma": None if gains is None else gains.best_sigma,
-        "common_sigma": None if gains is None else gains.common_sigma,
+        **(no_gains if gains is None else _best_gains(gains)),
         "as_measured": None if gains is None else {"value": gains.value, "sigma": gains.sigma},
         "trend": None if gains is None else {"value": gains.trend, "sigma": gains.trend_sigma},
         "rounds": [_round_document(one) for one in result.rounds],
         "closure": [asdict(step) for step in result.closure],
-        "converged": result.converged,
-        "loop_gain": result.loop_gain,
-        "frames": result.frames,
-        "lost_frames": result.lost_frames,
-        "beside": {
-            name: {"optical_gain": one.best, "sigma": one.best_sigma, "common_sigma": one.common_sigma}
-            for name, one in result.comparisons.items()
-        },
+        **_attributes(result, "converged", "loop_gain", "frames", "lost_frames"),
+        "beside": {name: _best_gains(one) for name, one in result.comparisons.items()},
         "partial": result.partial,
         "notes": list(result.notes),
     }
@@ -163,18 +141,19 @@ def gains_document(result: GainsResult) -> dict[str, Any]:
 
 def _round_document(one: GainRound) -> dict[str, Any]:
     return {
-        "poke": one.poke,
-        "frames": one.frames,
-        "optical_gain": one.gains.best,
-        "sigma": one.gains.best_sigma,
-        "common_sigma": one.gains.common_sigma,
-        "change": one.change,
-        "expected_change": one.expected_change,
-        "reached": one.reached,
-        "residual_nm": one.residual_nm,
-        "strehl_loss": one.strehl_loss,
+        **_attributes(one, "poke", "frames"),
+        **_best_gains(one.gains),
+        **_attributes(one, "change", "expected_change", "reached", "residual_nm", "strehl_loss"),
         "strehl": strehl_document(one.strehl),
     }
+
+
+def _best_gains(gains: OpticalGains) -> dict[str, Any]:
+    return {"optical_gain": gains.best, "sigma": gains.best_sigma, "common_sigma": gains.common_sigma}
+
+
+def _attributes(result: object, *names: str) -> dict[str, Any]:
+    return {name: getattr(result, name) for name in names}
 
 
 #: Maximum number of rows in a document; the CSV table has all rows.
@@ -188,19 +167,13 @@ def track_document(result: TrackResult) -> dict[str, Any]:
     residual, strehl = result.column("residual_nm"), result.column("strehl")
     return {
         "seconds": result.rows["seconds"][-1] if n else 0.0,
-        "frames": result.frames,
-        "lost_frames": result.lost_frames,
-        "rate_hz": result.rate_hz,
-        "poke": result.poke,
-        "stable": result.stable,
-        "partial": result.partial,
+        **_attributes(result, "frames", "lost_frames", "rate_hz", "poke", "stable", "partial"),
         "registration": {
             name: {"value": column[-1], "sigma": result.rows[f"{name}_sigma"][-1], "unit": UNITS[name]}
             for name, column in result.rows.items()
             if name in PARAMETERS and n
         },
-        "optical_gain": result.optical_gain,
-        "optical_gain_sigma": result.optical_gain_sigma,
+        **_attributes(result, "optical_gain", "optical_gain_sigma"),
         "residual_rms_nm": float(np.sqrt(np.nanmean(np.square(residual)))) if n else None,
         "strehl": float(np.nanmean(strehl)) if np.isfinite(strehl).any() else None,
         "exchanges": [asdict(one) for one in result.exchanges],

@@ -52,7 +52,7 @@ class RunFolder:
     ----------
     path
         The folder.
-    asked
+    requested_path
         The requested folder, when it already contained files and another one is used.
 
     Raises

@@ -46,22 +46,9 @@ _LOOP_FRAMES = "loop_frames"
 class PaperCase:
     """One of the paper's results.
 
-    Parameters
-    ----------
-    kind
-        Name on the command line.
-    title
-        What it shows.
-    system
-        System it runs on.
-    frames
-        Numbers of frames by the procedure's keyword.
-    procedure
-        Takes an open bench and the frames.
-    save
-        Saves the result, checks its criteria and writes the report.
-    overrides
-        Of the system's configuration.
+    ``kind`` is its name on the command line, ``frames`` the numbers of frames by keyword of the
+    ``procedure``, which takes an open bench. ``save`` saves the result, checks its criteria and writes the
+    report.
     """
 
     kind: str
@@ -98,12 +85,7 @@ def save_comparison(
     command: str,
     title: str,
 ) -> dict[str, Any]:
-    """Save products, ``result.json`` and report of several calibrations of one system.
-
-    Returns
-    -------
-    dict
-        The run's document; its ``criteria`` say which were met.
+    """Save products, ``result.json`` and report of several calibrations of one system; returns the document.
 
     Raises
     ------
@@ -122,15 +104,14 @@ def save_comparison(
         add_gains(folder, record, "gains", result.gains, {"im": saved["ESCAPE"], **others})
     escape = result.calibrations.get("ESCAPE")
     estimate = None if escape is None else escape.registration
-    checks = (
-        []
-        if result.partial
-        else [criteria.sprint_converged("ESCAPE", estimate), *criteria.loop_criteria(result.loops)]
-    )
-    if not result.partial and estimate is not None and record.injected is not None:
-        checks.insert(1, criteria.injected_value_recovered("ESCAPE", estimate, record.injected))
-    if not result.partial and result.gains is not None:
-        checks.append(criteria.gains_converged(result.gains))
+    checks = []
+    if not result.partial:
+        checks.append(criteria.sprint_converged("ESCAPE", estimate))
+        if estimate is not None and record.injected is not None:
+            checks.append(criteria.injected_value_recovered("ESCAPE", estimate, record.injected))
+        checks += criteria.loop_criteria(result.loops)
+        if result.gains is not None:
+            checks.append(criteria.gains_converged(result.gains))
     labels: dict[str, Any] = {product_key(label): {"label": label} for label in result.calibrations}
     labels |= {f"loop_{product_key(label)}": {"label": label} for label in result.loops}
     labels.setdefault("escape", {}).update(measured="DO-CRIME", column="")
@@ -154,42 +135,26 @@ def save_comparison(
 def save_table1(
     folder: RunFolder, record: BenchRecord, result: Table1Result, wall_seconds: float
 ) -> dict[str, Any]:
-    """Save products, ``result.json`` and report of :func:`~escape_hw.paper.experiments.reproduce_table1`.
-
-    Returns
-    -------
-    dict
-        The run's document; its ``criteria`` say which were met.
-
-    Raises
-    ------
-    StorageError
-        Something cannot be written.
-    """
-    labels, checks = {}, []
-    estimates = {}
+    """As :func:`save_comparison`, of :func:`~escape_hw.paper.experiments.reproduce_table1`."""
+    labels, checks, estimates = {}, [], {}
     for column, calibration in result.calibrations.items():
-        if calibration.registration is None:
-            # Stopped before SPRINT: only the DO-CRIME matrix exists.
-            source = product_key(f"docrime {column}")
-            add_calibration(folder, record, source, calibration)
-            labels[source] = {"label": f"DO-CRIME {column}"}
-            continue
-        name = product_key(f"escape {column}")
-        measured = measured_calibration(calibration)
+        estimate = calibration.registration
+        # Stopped before SPRINT, only the DO-CRIME matrix exists.
+        measured = calibration if estimate is None else measured_calibration(calibration)
         parents = {}
         if measured is not None:
             source = product_key(f"docrime {column}")
             parents = {source: add_calibration(folder, record, source, measured)}
             labels[source] = {"label": f"DO-CRIME {column}"}
+        if estimate is None:
+            continue
+        name = product_key(f"escape {column}")
         add_calibration(folder, record, name, calibration, parents)
         labels[name] = {"label": f"ESCAPE {column}", "measured": f"DO-CRIME {column}", "column": column}
-        checks.append(criteria.sprint_converged(column, calibration.registration))
-        estimates[column] = calibration.registration
+        checks.append(criteria.sprint_converged(column, estimate))
+        estimates[column] = estimate
         if record.injected is not None:
-            checks.append(
-                criteria.injected_value_recovered(column, calibration.registration, record.injected)
-            )
+            checks.append(criteria.injected_value_recovered(column, estimate, record.injected))
     if len(estimates) == 2:
         checks += criteria.short_and_long_agree(*estimates.values())
     document = {
@@ -254,14 +219,7 @@ def select_cases(kinds: Sequence[str] | None) -> list[PaperCase]:
 
 
 def check_share(cases: Sequence[tuple[PaperCase, SystemConfig]], share: float) -> None:
-    """Refuse a share of the frames that is too small for a matrix or a Strehl ratio.
-
-    Parameters
-    ----------
-    cases
-        The cases to run, with their configurations.
-    share
-        Share of the frames of each.
+    """Refuse a share of the cases' frames that is too small for a matrix or a Strehl ratio.
 
     Raises
     ------

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 from escape_hw.api.procedure import Procedure
@@ -47,14 +47,9 @@ class Table1Result:
 
 
 def reproduce_table1(bench: Bench, *, frames: Mapping[str, int] | None = None) -> Procedure[Table1Result]:
-    """ESCAPE with each number of frames (paper, Table 1).
+    """ESCAPE with each number of frames (paper, Table 1), by the heading of the column.
 
-    Parameters
-    ----------
-    bench
-        An open bench.
-    frames
-        Frames by the heading of the column; SHORT and LONG of the paper by default.
+    By default they are SHORT and LONG of the paper.
     """
     result = Table1Result()
     try:
@@ -72,15 +67,13 @@ def reproduce_table1(bench: Bench, *, frames: Mapping[str, int] | None = None) -
 def reproduce_shwfs(
     bench: Bench, *, frames: int = SHORT_FRAMES, loop_frames: int = 5000, realisations: int = 0
 ) -> Procedure[CalibrationComparison]:
-    """Calibrate with and without a source and close the loop with every matrix.
+    """Calibrate a bench with and without a source, and close the loop with every matrix.
 
     The push-pull baseline and the model PSF are measured without the phase screen; the DO-CRIME and
     ESCAPE calibrations and all loops under turbulence. No step reads the true state of a simulation.
 
     Parameters
     ----------
-    bench
-        An open bench with a science camera.
     frames
         Frames of the DO-CRIME measurement.
     loop_frames
@@ -94,12 +87,8 @@ def reproduce_shwfs(
     TooFewFrames
         For the number of modes; nothing moved.
     """
-    from escape_hw.calibration.docrime.open_loop import require_enough_frames
 
-    # Checked before the baseline is measured.
-    require_enough_frames(bench.config.calibration, frames, bench.config.basis.n_modes)
-    result = CalibrationComparison()
-    try:
+    def steps(result: CalibrationComparison) -> Procedure[None]:
         yield from measure_matrices(bench, frames, result)
         if not result.partial:
             yield from _close_loops(bench, loop_frames, result)
@@ -111,6 +100,20 @@ def reproduce_shwfs(
             except CalibrationError as error:
                 # The other results do not depend on it.
                 result.notes.append(f"no curve of error against frames: {error}")
+
+    return (yield from _comparison(bench, frames, steps))
+
+
+def _comparison(
+    bench: Bench, frames: int, steps: Callable[[CalibrationComparison], Procedure[None]]
+) -> Procedure[CalibrationComparison]:
+    """Check the frames before anything moves, and run steps that add to a comparison."""
+    from escape_hw.calibration.docrime.open_loop import require_enough_frames
+
+    require_enough_frames(bench.config.calibration, frames, bench.config.basis.n_modes)
+    result = CalibrationComparison()
+    try:
+        yield from steps(result)
     except Aborted:
         result.partial = True
     return result
@@ -127,15 +130,13 @@ def _close_loops(bench: Bench, loop_frames: int, result: CalibrationComparison) 
 def reproduce_pywfs(
     bench: Bench, *, frames: int = SHORT_FRAMES, closed_frames: int = 10_000, loop_frames: int = 5000
 ) -> Procedure[CalibrationComparison]:
-    """Measure four matrices and the optical gains of three, and close six loops.
+    """Measure four matrices and the optical gains of three on a pyramid bench, and close six loops.
 
     All share the sensor geometry and the references measured under turbulence, so that the loops differ
     in the matrix only. No step reads the true state of a simulation.
 
     Parameters
     ----------
-    bench
-        An open pyramid bench with a science camera.
     frames
         Frames of the DO-CRIME measurement in open loop.
     closed_frames
@@ -156,17 +157,13 @@ def reproduce_pywfs(
     CalibrationError
         No gain gives a stable loop.
     """
-    from escape_hw.calibration.docrime.open_loop import require_enough_frames
 
-    require_enough_frames(bench.config.calibration, frames, bench.config.basis.n_modes)
-    result = CalibrationComparison()
-    try:
+    def steps(result: CalibrationComparison) -> Procedure[None]:
         yield from measure_matrices(bench, frames, result, common_geometry=True)
         if not result.partial:
             yield from _gains_and_loops(bench, closed_frames, loop_frames, result)
-    except Aborted:
-        result.partial = True
-    return result
+
+    return (yield from _comparison(bench, frames, steps))
 
 
 def _gains_and_loops(
@@ -199,8 +196,6 @@ def reproduce_maps(
 
     Parameters
     ----------
-    bench
-        An open telescope with a science camera.
     frames
         Frames of the DO-CRIME measurement.
     loop_frames
@@ -219,23 +214,19 @@ def reproduce_maps(
     CalibrationError
         No gain gives a stable loop.
     """
-    from escape_hw.calibration.docrime.open_loop import require_enough_frames
     from escape_hw.calibration.sprint.synthetic_matrix import nominal_calibration
 
-    require_enough_frames(bench.config.calibration, frames, bench.config.basis.n_modes)
-    result = CalibrationComparison()
-    try:
+    def steps(result: CalibrationComparison) -> Procedure[None]:
         found = yield from calibrate_with_method(bench, "escape", frames=frames)
         result.partial = found.partial
         measured = found if found.partial else measured_calibration(found)
         if measured is not None:
             result.calibrations["DO-CRIME"] = measured
         if found.partial:
-            return result
+            return
         result.calibrations["ESCAPE"] = found
         yield from _close_loops(bench, loop_frames, result)
         if not result.partial:
             result.calibrations["simulation"] = nominal_calibration(bench, found.grid, found.matrix.m2c)
-    except Aborted:
-        result.partial = True
-    return result
+
+    return (yield from _comparison(bench, frames, steps))

@@ -91,19 +91,14 @@ def _difference(run: RunContent | None, first: str, second: str) -> str | None:
 
 
 def _shwfs_numbers(run: RunContent | None) -> Iterator[PaperNumber]:
-    yield PaperNumber(
-        "Shack-Hartmann, Strehl of ESCAPE minus baseline",
-        "consistent",
-        _difference(run, "ESCAPE", "push-pull"),
-    )
-    yield PaperNumber(
-        "Shack-Hartmann, Strehl of DO-CRIME minus baseline", "very slightly worse",
-        _difference(run, "DO-CRIME", "push-pull"),
-    )  # fmt: skip
-    rate = None if run is None or not run.loops else next(iter(run.loops.values()))
-    yield PaperNumber(
-        "Shack-Hartmann, loop speed", "500 Hz", None if rate is None else f"{rate.rate_hz:.0f} Hz"
-    )
+    for matrix, words in (("ESCAPE", "consistent"), ("DO-CRIME", "very slightly worse")):
+        found = _difference(run, matrix, "push-pull")
+        yield PaperNumber(f"Shack-Hartmann, Strehl of {matrix} minus baseline", words, found)
+    yield PaperNumber("Shack-Hartmann, loop speed", "500 Hz", _loop_speed(run))
+
+
+def _loop_speed(run: RunContent | None) -> str | None:
+    return None if run is None or not run.loops else f"{next(iter(run.loops.values())).rate_hz:.0f} Hz"
 
 
 def _format_gains(gains: OpticalGains | None) -> str | None:
@@ -116,15 +111,9 @@ def _format_gains(gains: OpticalGains | None) -> str | None:
 def _pywfs_numbers(run: RunContent | None) -> Iterator[PaperNumber]:
     result = None if run is None else next(iter(run.gains.values()), None)
     beside: Mapping[str, OpticalGains] = {} if result is None else result.comparisons
-    yield PaperNumber(
-        "pyramid, optical gain of the baseline",
-        "< 1, roughly constant",
-        _format_gains(beside.get("push-pull")),
-    )
-    yield PaperNumber(
-        "pyramid, optical gain of open-loop DO-CRIME", "> 1, roughly constant",
-        _format_gains(beside.get("DO-CRIME")),
-    )  # fmt: skip
+    for label, what, sign in (("push-pull", "the baseline", "<"), ("DO-CRIME", "open-loop DO-CRIME", ">")):
+        found = _format_gains(beside.get(label))
+        yield PaperNumber(f"pyramid, optical gain of {what}", f"{sign} 1, roughly constant", found)
     poke = None if result is None or not result.rounds else f"{100 * result.rounds[-1].poke:.2g} %"
     yield PaperNumber("pyramid, pokes in closed loop, share of the stroke", "0.1 to 0.2 %", poke)
     for first, second, words in (
@@ -135,8 +124,7 @@ def _pywfs_numbers(run: RunContent | None) -> Iterator[PaperNumber]:
     ):
         found = _difference(run, first, second)
         yield PaperNumber(f"pyramid, Strehl of {first} minus {second}", words, found)
-    loop = None if run is None or not run.loops else next(iter(run.loops.values()))
-    yield PaperNumber("pyramid, loop speed", "300 Hz", None if loop is None else f"{loop.rate_hz:.0f} Hz")
+    yield PaperNumber("pyramid, loop speed", "300 Hz", _loop_speed(run))
 
 
 def _maps_numbers(run: RunContent | None) -> Iterator[PaperNumber]:
@@ -193,8 +181,6 @@ def write_results(folder: Path, runs: Mapping[str, Path]) -> Path:
 
     Parameters
     ----------
-    folder
-        Target folder.
     runs
         Run folders by the kinds of :data:`~escape_hw.paper.results.PAPER_RUNS`. Missing ones are marked,
         with the command that runs them.
@@ -219,7 +205,7 @@ def write_results(folder: Path, runs: Mapping[str, Path]) -> Path:
         lines += ["SIMULATED: ours come from simulations.", ""]
     lines += ["| number | paper | ours | command |", "|---|---|---|---|"]
     rows = [(part, number) for part in PAPER_RUNS for number in part.numbers(contents.get(part.kind))]
-    lines += [_table_row(number, part.command) for part, number in rows]
+    lines += [f"| {n.what} | {n.paper} | {n.ours or '(not run)'} | `{part.command}` |" for part, n in rows]
     for kind, run in contents.items():
         for name, caption, figure in _figures(kind, run):
             write_atomic(folder / f"{name}.png", style.png(figure, dpi=80))
@@ -231,10 +217,6 @@ def write_results(folder: Path, runs: Mapping[str, Path]) -> Path:
     ]
     write_atomic(folder / "results.json", (dumps({"simulated": simulated, "rows": document}) + "\n").encode())
     return path
-
-
-def _table_row(number: PaperNumber, command: str) -> str:
-    return f"| {number.what} | {number.paper} | {number.ours or '(not run)'} | `{command}` |"
 
 
 def _figures(kind: str, run: RunContent) -> Iterator[tuple[str, str, Figure]]:
@@ -270,12 +252,7 @@ INDEX_PAGE = "index.html"
 def write_index(folder: Path, parts: Mapping[str, Mapping[str, Any]]) -> Path:
     """Write ``index.html`` with links to the reports of the runs, and return its path.
 
-    Parameters
-    ----------
-    folder
-        Target folder; links are relative to it.
-    parts
-        Documents of the runs by name, each with its ``criteria`` and its ``products``.
+    ``parts`` are the documents of the runs by name; links are relative to the folder.
 
     Raises
     ------
@@ -284,7 +261,11 @@ def write_index(folder: Path, parts: Mapping[str, Mapping[str, Any]]) -> Path:
     """
     folder = folder.absolute()
     body = ["<h1>The paper's tables and figures, reproduced</h1>"]
-    body += [_run_section(folder, name, document) for name, document in parts.items()]
+    for name, document in parts.items():
+        report = document["products"].get("report")
+        link = "" if report is None else html.link(os.path.relpath(report, folder), "report")
+        checks = html.criteria_list(document.get("criteria") or [])
+        body.append(html.section(str(document.get("title") or name), checks, f"<p>{link}</p>"))
     simulated = any(document.get("simulated") for document in parts.values())
     band = "SIMULATED: every number comes from a simulation" if simulated else "HARDWARE"
     path = folder / INDEX_PAGE
@@ -292,13 +273,3 @@ def write_index(folder: Path, parts: Mapping[str, Mapping[str, Any]]) -> Path:
         path, html.page("Reproduced", [("simulated" if simulated else "hardware", band)], body).encode()
     )
     return path
-
-
-def _run_section(folder: Path, name: str, document: Mapping[str, Any]) -> str:
-    report = document["products"].get("report")
-    link = "" if report is None else html.link(os.path.relpath(report, folder), "report")
-    return html.section(
-        str(document.get("title") or name),
-        html.criteria_list(document.get("criteria") or []),
-        f"<p>{link}</p>",
-    )

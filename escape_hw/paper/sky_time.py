@@ -29,6 +29,7 @@ from escape_hw.calibration.sprint.telemetry_fit import decorrelate_columns, tele
 from escape_hw.config.devices import DeviceConfig
 from escape_hw.config.loader import load_system, load_text
 from escape_hw.config.system import SystemConfig
+from escape_hw.deprecation import renamed_text, warn_renamed
 from escape_hw.errors import Aborted, CalibrationError, TooFewFrames
 from escape_hw.runtime.host.processes import open_process_pool, terminate_pool
 from escape_hw.runtime.session.system import System
@@ -42,7 +43,7 @@ PYRAMID_GOAL = np.array([4.0, 4.0, 0.05, 0.2, 0.2])
 #: Frames at which the errors are taken.
 FRAMES = (20, 50, 100, 220, 300, 500, 1000)
 #: From the paper's matrix, from the whitened matrix, and from the whitened frames.
-ESTIMATORS = ("plain", "whitened", "telemetry")
+ESTIMATORS = ("unwhitened", "whitened", "telemetry")
 #: Seconds between two looks at an abort.
 _POLL_S = 0.2
 
@@ -82,17 +83,22 @@ def simulated_config(
 ) -> SystemConfig:
     """The configuration of a system with every device simulated.
 
-    Parameters
-    ----------
-    system
-        Name or path of a system, or its configuration.
-    overrides, seed
-        As for :func:`~escape_hw.config.loader.load_system`.
+    ``overrides`` and ``seed`` are those of :func:`~escape_hw.config.loader.load_system`.
     """
     config = load_system(system) if isinstance(system, str) else system
     overridden = [name for name, device in config.devices if isinstance(device, DeviceConfig) and device.mode]
     changes = [*(f"devices.{name}.mode=sim" for name in overridden), *overrides]
     return load_text(config.to_toml(), config.system.name, overrides=changes, seed=seed, mode="sim")
+
+
+def realisation_config(
+    system: str | SystemConfig, number: int, overrides: Sequence[str] = ()
+) -> tuple[Registration, SystemConfig]:
+    """Registration of realisation ``number``, and the simulated configuration that has it."""
+    injected = random_registration(number)
+    return injected, simulated_config(
+        system, [*overrides, *registration_overrides(injected)], seed=number + 1
+    )
 
 
 def run_realisation(
@@ -107,8 +113,10 @@ def run_realisation(
     The estimators read frames, indices and commands; the true registration is only compared at the end.
     Without ``"whitened"`` among ``estimators`` the noise, and with it the bound, is unknown.
     """
-    injected = random_registration(number)
-    config = simulated_config(system, [*overrides, *registration_overrides(injected)], seed=number + 1)
+    if "plain" in estimators:
+        warn_renamed(renamed_text("the estimator 'plain'", "'unwhitened'"))
+        estimators = [*estimators, "unwhitened"]
+    injected, config = realisation_config(system, number, overrides)
     errors = np.full((len(ESTIMATORS), len(frames), 5), np.nan)
     sigmas, bounds = errors.copy(), np.full((2, len(frames), 5), np.nan)
     with System.from_config(config) as bench:
@@ -194,13 +202,11 @@ def sky_time(
     Parameters
     ----------
     system
-        Name or path of a system, or its configuration; it is simulated.
+        Name or path of a system, or its configuration; it is simulated, with the overrides.
     realisations
         Number of random registrations.
     frames
         Numbers of frames at which to estimate, ascending.
-    overrides
-        Configuration overrides, ``section.key=value`` each.
     workers
         Parallel processes.
 

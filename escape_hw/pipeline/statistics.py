@@ -26,15 +26,9 @@ def standard_error(series: NDArray[np.floating]) -> float:
     window W balances truncation and statistical error (Wolff 2004, Comput. Phys. Commun. 156, 143, eq. 52).
     The bias of the autocovariances about the series' own mean, ``-sigma^2``, is corrected.
 
-    Parameters
-    ----------
-    series
-        Values in order ``(n,)``.
+    ``series``: values in order ``(n,)``.
 
-    Returns
-    -------
-    float
-        NaN for fewer than :data:`MIN_SAMPLES` values.
+    Returns NaN for fewer than :data:`MIN_SAMPLES` values.
     """
     n = series.size
     if n < MIN_SAMPLES:
@@ -82,15 +76,11 @@ class PairedComparison:
 
     Parameters
     ----------
-    mean, sigma
-        The mean and its standard error.
     low, high
         Confidence interval of the mean, at :data:`CONFIDENCE`.
     equivalence
         Smallest margin x within which A and B are equivalent at :data:`CONFIDENCE` by two one-sided tests
         (Schuirmann 1987): the interval of twice the error probability lies within -x..x.
-    pairs
-        Number of pairs.
     """
 
     mean: float
@@ -118,12 +108,7 @@ def compare_pairs(
     Resampled means are divided by their own standard errors, so that the intervals hold also for few pairs,
     for which plain percentiles are too narrow.
 
-    Parameters
-    ----------
-    first, second
-        Values of A and B for the same turbulence ``(n,)``.
-    seed
-        Seed of the resampling.
+    ``first``, ``second``: values of A and B for the same turbulence ``(n,)``.
 
     Raises
     ------
@@ -152,14 +137,8 @@ def compare_pairs(
 def describe_comparison(first: str, second: str, comparison: PairedComparison, margin: float) -> str:
     """Describe a comparison of Strehl ratios in a sentence, in percent.
 
-    Parameters
-    ----------
-    first, second
-        Names of A and B.
-    comparison
-        Their comparison.
-    margin
-        Difference of the Strehl ratio within which they count as equivalent.
+    ``first``, ``second``: names of A and B; ``margin``: difference of the Strehl ratio within which they
+    count as equivalent.
     """
     confidence = f"{100 * CONFIDENCE:.0f} %"
     mean, sigma, equivalence = 100 * comparison.mean, 100 * comparison.sigma, 100 * comparison.equivalence

@@ -9,22 +9,21 @@ import sys
 import threading
 import time
 import uuid
-import warnings
 from collections import deque
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
 
 from escape_hw.api.procedure import Progress
+from escape_hw.deprecation import renamed_members
 from escape_hw.errors import Aborted, CalibrationError, ClientUnknown, EscapeError, ServerGone
 from escape_hw.remote import requests as ask
 from escape_hw.remote.address import Endpoint, resolve
 from escape_hw.remote.keys import client_keys, keys_hint
-from escape_hw.remote.source import Sample
+from escape_hw.remote.source import Sample, present_stream
 from escape_hw.remote.state import (
     SCHEMA,
     ActiveRun,
@@ -52,17 +51,7 @@ _SERVER_TIMEOUT_S = 15.0
 
 
 class RemoteRun:
-    """A run on a server.
-
-    Parameters
-    ----------
-    connection
-        Connection to the server.
-    id
-        Number of the run.
-    name
-        Name of the procedure.
-    """
+    """A run on a server: its number ``id``, and the ``name`` of its procedure."""
 
     def __init__(self, connection: Connection, id: int, name: str) -> None:
         self._connection, self.id, self.name = connection, id, name
@@ -128,7 +117,12 @@ class RemoteRun:
                     )
                 self._require_engine()
                 if view is not None and (running := self.running) is not None:
-                    view(_progress(running))
+                    view(
+                        Progress(
+                            running.stage, running.completed, running.total, running.unit, running.elapsed_s,
+                            running.metrics,
+                        )
+                    )  # fmt: skip
         return self._result(ended)
 
     def _require_engine(self) -> None:
@@ -162,12 +156,6 @@ def load_result(ended: FinishedRun) -> Any:
     return ended.document or None
 
 
-def _progress(running: ActiveRun) -> Progress:
-    return Progress(
-        running.stage, running.completed, running.total, running.unit, running.elapsed_s, running.metrics
-    )
-
-
 def _program() -> str:
     """Default name of this client: the name of its script, or ``notebook``."""
     name = os.path.basename(sys.argv[0])
@@ -183,6 +171,7 @@ _LINES = 5000
 _EVENT_S = 10.0
 
 
+@renamed_members(check="plan")
 class Connection:
     """A connection to a server, see :func:`connect`; implements :class:`~escape_hw.remote.source.DataSource`.
 
@@ -236,7 +225,7 @@ class Connection:
         self._registered = True
         with self._changed:
             self._state = State.model_validate(answer)
-        lines, _ = self._request(ask.GetLog, count=1000)
+        lines, _ = self._request("log", count=1000)
         with self._changed:
             known = {line.number for line in self._log}
             old = [LogLine.model_validate(line) for line in lines if line["number"] not in known]
@@ -266,9 +255,7 @@ class Connection:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def __repr__(self) -> str:
@@ -285,23 +272,20 @@ class Connection:
         # A client that was suspended for long is no longer registered.
         return self._registration() if refused else {"verb": "heartbeat", "client": self.client}
 
-    def _ask(self, request: ask.Request, timeout_s: float = TIMEOUT_S) -> tuple[Any, bytes]:
+    def _request(self, verb: str, timeout_s: float = TIMEOUT_S, **fields: Any) -> tuple[Any, bytes]:
+        """Send a request; returns its answer and bytes (ConfigError: a field is out of range)."""
+        request = ask.build_request(verb, client=self.client, **fields)
         document = request.model_dump(mode="json")
         try:
             answer, data, serial = self._link.send_request(document, timeout_s)
         except ClientUnknown:
             self._register()
             answer, data, serial = self._link.send_request(document, timeout_s)
-        if isinstance(request, ask.STATE_CHANGING_REQUESTS):
+        if verb in ask.STATE_CHANGING_VERBS:
             # Events and replies use different sockets: wait for the state that shows the effect.
             with self._changed:
                 self._changed.wait_for(lambda: self._state.serial >= serial, _EVENT_S)
         return answer, data
-
-    def _request(
-        self, kind: type[ask.Request], timeout_s: float = TIMEOUT_S, **fields: Any
-    ) -> tuple[Any, bytes]:
-        return self._ask(ask.build_request(kind, client=self.client, **fields), timeout_s)
 
     def _event(self, topic: str, document: dict[str, Any]) -> None:
         with self._changed:
@@ -338,6 +322,7 @@ class Connection:
 
     def latest(self, stream: str, after: int = -1) -> Sample | None:
         """The newest entry of a stream; ``None`` when there is none newer than ``after``."""
+        stream = present_stream(stream)
         if not self._is_local:
             return self._latest_over_network(stream, after)
         segment = next((one.segment for one in self._state.streams if one.name == stream), None)
@@ -346,7 +331,7 @@ class Connection:
 
     def _latest_over_network(self, stream: str, after: int) -> Sample | None:
         try:
-            head, data = self._request(ask.GetLatestSample, stream=stream, after=after)
+            head, data = self._request("latest_sample", stream=stream, after=after)
         except ServerGone:
             return None
         if head is None:
@@ -361,7 +346,7 @@ class Connection:
         known = self._geometry
         if known is None or known[0] != key:
             try:
-                answer, _ = self._request(ask.GetGeometry)
+                answer, _ = self._request("geometry")
             except EscapeError:
                 return Geometry() if known is None else known[1]
             known = self._geometry = (key, Geometry.model_validate(answer))
@@ -375,7 +360,7 @@ class Connection:
     def procedures(self) -> Sequence[ProcedureEntry]:
         """The procedures with their parameters."""
         if self._procedures is None:
-            answer, _ = self._request(ask.GetProcedures, SLOW_TIMEOUT_S)
+            answer, _ = self._request("procedures", SLOW_TIMEOUT_S)
             self._procedures = tuple(ProcedureEntry.model_validate(entry) for entry in answer)
         return self._procedures
 
@@ -387,15 +372,8 @@ class Connection:
         ConfigError
             An argument is unknown or out of range.
         """
-        answer, _ = self._request(
-            ask.PlanProcedure, SLOW_TIMEOUT_S, procedure=procedure, arguments=arguments or {}
-        )
+        answer, _ = self._request("plan", SLOW_TIMEOUT_S, procedure=procedure, arguments=arguments or {})
         return ProcedurePlan.model_validate(answer)
-
-    def check(self, procedure: str, arguments: Arguments | None = None) -> ProcedurePlan:
-        """Plan a procedure; deprecated name of :meth:`plan`."""
-        warnings.warn("check() is now called plan()", DeprecationWarning, stacklevel=2)
-        return self.plan(procedure, arguments)
 
     def wait_for(self, run: int, timeout_s: float) -> FinishedRun | None:
         """The end of a run; ``None`` when it has not ended within the time-out."""
@@ -419,7 +397,7 @@ class Connection:
         LeaseHeld
             Another client has control.
         """
-        answer, _ = self._request(ask.AcquireLease, take_over=take_over)
+        answer, _ = self._request("acquire_lease", take_over=take_over)
         lease = Lease.model_validate(answer)
         self._set_lease(lease)
         return lease
@@ -427,7 +405,7 @@ class Connection:
     def release(self) -> None:
         """Release control; does nothing when the server is gone."""
         try:
-            self._request(ask.ReleaseLease, 1.0)
+            self._request("release_lease", 1.0)
         except ServerGone:
             return
         self._set_lease(None)
@@ -440,15 +418,15 @@ class Connection:
     # ------------------------------------------------------------ safety
     def open_loop(self) -> None:
         """Open the loop; returns when the mirror is flat. Needs no control."""
-        self._request(ask.OpenLoop, SLOW_TIMEOUT_S)
+        self._request("open_loop", SLOW_TIMEOUT_S)
 
     def flatten(self) -> None:
         """Abort all activity; returns when the mirror is flat. Needs no control."""
-        self._request(ask.Flatten, SLOW_TIMEOUT_S)
+        self._request("flatten", SLOW_TIMEOUT_S)
 
     def abort(self) -> None:
         """Abort the procedure and save its data; returns when the mirror is flat. Needs no control."""
-        self._request(ask.AbortProcedure, SLOW_TIMEOUT_S)
+        self._request("abort_procedure", SLOW_TIMEOUT_S)
 
     # ------------------------------------------------------------ control
     def start(self, procedure: str, **arguments: float | int | bool | str | None) -> RemoteRun:
@@ -473,10 +451,7 @@ class Connection:
         declared = next((each for each in PROCEDURES if each.name == procedure), None)
         if declared is not None:
             arguments = present_names(declared.parameters(), arguments)
-        request = ask.build_request(
-            ask.StartProcedure, client=self.client, procedure=procedure, arguments=arguments
-        )
-        number, _ = self._ask(request, SLOW_TIMEOUT_S)
+        number, _ = self._request("start_procedure", SLOW_TIMEOUT_S, procedure=procedure, arguments=arguments)
         return RemoteRun(self, int(number), procedure)
 
     @procedure_method(EscapeProcedure)
@@ -532,11 +507,11 @@ class Connection:
 
     def pause(self) -> None:
         """Pause the running procedure between two steps, mirror flat."""
-        self._request(ask.PauseProcedure)
+        self._request("pause_procedure")
 
     def resume(self) -> None:
         """Resume a paused procedure."""
-        self._request(ask.ResumeProcedure)
+        self._request("resume_procedure")
 
     def close_loop(
         self,
@@ -546,8 +521,9 @@ class Connection:
         dropped_modes: int | None = None,
     ) -> None:
         """Close the loop with a matrix of ``state.products`` until it is opened."""
-        settings = {"matrix": matrix, "gain": gain, "leak": leak, "dropped_modes": dropped_modes}
-        self._request(ask.CloseLoop, SLOW_TIMEOUT_S, **settings)
+        self._request(
+            "close_loop", SLOW_TIMEOUT_S, matrix=matrix, gain=gain, leak=leak, dropped_modes=dropped_modes
+        )
 
     def set_loop(
         self,
@@ -557,25 +533,26 @@ class Connection:
         dropped_modes: int | None = None,
     ) -> None:
         """Change parameters of the loop, closed or not; absent ones stay."""
-        settings = {"matrix": matrix, "gain": gain, "leak": leak, "dropped_modes": dropped_modes}
-        self._request(ask.SetLoop, SLOW_TIMEOUT_S, **settings)
+        self._request(
+            "set_loop", SLOW_TIMEOUT_S, matrix=matrix, gain=gain, leak=leak, dropped_modes=dropped_modes
+        )
 
     def load_product(self, path: str | Path, name: str | None = None) -> ProductEntry:
         """Load a FITS product into the server, by default under its file's name."""
-        answer, _ = self._request(ask.LoadProduct, SLOW_TIMEOUT_S, path=str(path), name=name)
+        answer, _ = self._request("load_product", SLOW_TIMEOUT_S, path=str(path), name=name)
         return ProductEntry.model_validate(answer)
 
     def record(self, on: bool) -> None:
         """Start or stop recording telemetry at full rate."""
-        self._request(ask.SetRecording, SLOW_TIMEOUT_S, on=on)
+        self._request("set_recording", SLOW_TIMEOUT_S, on=on)
 
     def clear_fault(self) -> None:
         """Release the latched fault; closed devices are opened again."""
-        self._request(ask.ClearFault, SLOW_TIMEOUT_S)
+        self._request("clear_fault", SLOW_TIMEOUT_S)
 
     def shutdown(self) -> None:
         """Make the mirror safe and end the server."""
-        self._request(ask.Shutdown)
+        self._request("shutdown")
 
 
 def connect(address: str, *, control: bool = False, take_over: bool = False, name: str = "") -> Connection:

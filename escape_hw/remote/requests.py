@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
@@ -27,30 +27,38 @@ class Request(BaseModel):
     client: ClientId
 
 
-R = TypeVar("R", bound=Request)
-
-
 def first_error(error: ValidationError) -> str:
     """Location and message of the first validation error."""
     first = error.errors(include_url=False, include_input=False)[0]
     return f"{'.'.join(map(str, first['loc'])) or 'the text'}: {first['msg']}"
 
 
-def build_request(kind: type[R], **fields: Any) -> R:
-    """Build a request from a caller's arguments.
+class PlainRequest(Request):
+    """A request without arguments.
 
-    Raises
-    ------
-    ConfigError
-        A field is of the wrong kind or out of range.
+    ``state``, ``geometry``, ``procedures``
+        Answered with the documents of :mod:`escape_hw.remote.state`.
+    ``heartbeat``
+        Keeps the client registered and its lease valid.
+    ``release_lease``
+        Release the lease.
+    ``open_loop``, ``flatten``, ``abort_procedure``
+        Open the loop, and abort a procedure that works in closed loop; abort all activity; stop the running
+        procedure, whose data are saved. Answered when the mirror is flat.
+    ``pause_procedure``, ``resume_procedure``
+        Pause the running procedure between two steps, mirror flat; resume it.
+    ``clear_fault``
+        Release the latched fault and open the devices again.
+    ``shutdown``
+        Make the mirror safe and end the server.
     """
-    try:
-        return kind(**fields)
-    except ValidationError as error:
-        raise ConfigError(first_error(error)) from None
+
+    verb: Literal[
+        "state", "geometry", "procedures", "heartbeat", "release_lease", "open_loop", "flatten",
+        "abort_procedure", "pause_procedure", "resume_procedure", "clear_fault", "shutdown",
+    ]  # fmt: skip
 
 
-# ---------------------------------------------------------------- read only
 class RegisterClient(Request):
     """First request of a client: its name and its version of the protocol. Answered with the state.
 
@@ -63,24 +71,6 @@ class RegisterClient(Request):
     name: Name
     host: Name
     pid: int
-
-
-class GetState(Request):
-    """Answered with :class:`~escape_hw.remote.state.State`."""
-
-    verb: Literal["state"] = "state"
-
-
-class GetGeometry(Request):
-    """Answered with :class:`~escape_hw.remote.state.Geometry`."""
-
-    verb: Literal["geometry"] = "geometry"
-
-
-class GetProcedures(Request):
-    """Answered with a list of :class:`~escape_hw.remote.state.ProcedureEntry`."""
-
-    verb: Literal["procedures"] = "procedures"
 
 
 class GetLog(Request):
@@ -100,15 +90,6 @@ class GetLatestSample(Request):
     after: int = -1
 
 
-class PlanProcedure(Request):
-    """Plan a procedure; nothing moves. Answered with :class:`~escape_hw.remote.state.ProcedurePlan`."""
-
-    verb: Literal["plan"] = "plan"
-    procedure: Name
-    arguments: Arguments = Field(default_factory=dict)
-
-
-# ---------------------------------------------------------------- the lease
 class AcquireLease(Request):
     """Acquire the lease; refused while another client holds it."""
 
@@ -117,73 +98,35 @@ class AcquireLease(Request):
     take_over: bool = False
 
 
-class ClientHeartbeat(Request):
-    """Keeps the client registered and its lease valid."""
+class ProcedureRequest(Request):
+    """Plan a procedure, or start it.
 
-    verb: Literal["heartbeat"] = "heartbeat"
+    ``plan`` moves nothing and is answered with :class:`~escape_hw.remote.state.ProcedurePlan`,
+    ``start_procedure`` with the number of the run.
+    """
 
-
-class ReleaseLease(Request):
-    """Release the lease."""
-
-    verb: Literal["release_lease"] = "release_lease"
-
-
-# ---------------------------------------------------------------- safety: allowed to every client at any time
-class OpenLoop(Request):
-    """Open the loop and flatten the mirror; aborts a procedure that works in closed loop."""
-
-    verb: Literal["open_loop"] = "open_loop"
-
-
-class Flatten(Request):
-    """Abort all activity, open the loop, ramp the mirror flat."""
-
-    verb: Literal["flatten"] = "flatten"
-
-
-class AbortProcedure(Request):
-    """Stop the running procedure; the measured data are saved."""
-
-    verb: Literal["abort_procedure"] = "abort_procedure"
-
-
-# ---------------------------------------------------------------- control: needs the lease
-class StartProcedure(Request):
-    """Start a procedure; answered with the number of the run."""
-
-    verb: Literal["start_procedure"] = "start_procedure"
+    verb: Literal["plan", "start_procedure"]
     procedure: Name
     arguments: Arguments = Field(default_factory=dict)
 
 
-class PauseProcedure(Request):
-    """Pause the running procedure between two steps, mirror flat."""
+class LoopRequest(Request):
+    """Parameters of the loop; absent ones stay."""
 
-    verb: Literal["pause_procedure"] = "pause_procedure"
-
-
-class ResumeProcedure(Request):
-    """Resume a paused procedure."""
-
-    verb: Literal["resume_procedure"] = "resume_procedure"
-
-
-class _LoopRequest(Request):
     gain: Gain | None = None
     leak: Share | None = None
     dropped_modes: Annotated[int, Field(ge=0, le=10000)] | None = None
 
 
-class CloseLoop(_LoopRequest):
+class CloseLoop(LoopRequest):
     """Close the loop on a matrix until it is opened."""
 
     verb: Literal["close_loop"] = "close_loop"
     matrix: Name
 
 
-class SetLoop(_LoopRequest):
-    """Change parameters of the loop, closed or not; absent ones stay. The transition is bumpless."""
+class SetLoop(LoopRequest):
+    """Change parameters of the loop, closed or not. The transition is bumpless."""
 
     verb: Literal["set_loop"] = "set_loop"
     matrix: Name | None = None
@@ -204,40 +147,39 @@ class SetRecording(Request):
     on: bool
 
 
-class ClearFault(Request):
-    """Release the latched fault and open the devices again."""
-
-    verb: Literal["clear_fault"] = "clear_fault"
-
-
-class Shutdown(Request):
-    """Make the mirror safe and end the server."""
-
-    verb: Literal["shutdown"] = "shutdown"
-
-
 AnyRequest = Annotated[
-    RegisterClient | GetState | GetGeometry | GetProcedures | GetLog | GetLatestSample | PlanProcedure
-    | AcquireLease | ClientHeartbeat | ReleaseLease | OpenLoop | Flatten | AbortProcedure | StartProcedure
-    | PauseProcedure | ResumeProcedure | CloseLoop | SetLoop | LoadProduct | SetRecording | ClearFault
-    | Shutdown,
+    PlainRequest | RegisterClient | GetLog | GetLatestSample | AcquireLease | ProcedureRequest | CloseLoop
+    | SetLoop | LoadProduct | SetRecording,
     Field(discriminator="verb"),
 ]  # fmt: skip
 
 #: Validates requests; raises :class:`pydantic.ValidationError`.
 REQUESTS: TypeAdapter[AnyRequest] = TypeAdapter(AnyRequest)
 
-#: Requests that need the lease.
-LEASE_REQUESTS = (
-    StartProcedure, PauseProcedure, ResumeProcedure, CloseLoop, SetLoop, LoadProduct, SetRecording,
-    ClearFault, Shutdown,
-)  # fmt: skip
+
+def build_request(verb: str, **fields: Any) -> AnyRequest:
+    """Build a request from a caller's arguments.
+
+    Raises
+    ------
+    ConfigError
+        A field is of the wrong kind or out of range.
+    """
+    try:
+        return REQUESTS.validate_python({"verb": verb, **fields})
+    except ValidationError as error:
+        raise ConfigError(first_error(error)) from None
+
+
 #: Requests that are allowed to every client at any time.
-SAFETY_REQUESTS = (OpenLoop, Flatten, AbortProcedure)
+SAFETY_VERBS = frozenset({"open_loop", "flatten", "abort_procedure"})
+#: Requests that need the lease.
+LEASE_VERBS = frozenset({
+    "start_procedure", "pause_procedure", "resume_procedure", "close_loop", "set_loop", "load_product",
+    "set_recording", "clear_fault", "shutdown",
+})  # fmt: skip
 #: Requests that change the state.
-STATE_CHANGING_REQUESTS = (
-    *(kind for kind in LEASE_REQUESTS if kind is not Shutdown), AcquireLease, ReleaseLease, *SAFETY_REQUESTS,
-)  # fmt: skip
+STATE_CHANGING_VERBS = SAFETY_VERBS | LEASE_VERBS - {"shutdown"} | {"acquire_lease", "release_lease"}
 
 
 #: Errors that keep their class on the wire, by name; every other one arrives as :class:`EscapeError`.

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Protocol
 
-from escape_hw.remote.state import Arguments, Geometry, LogLine, ProcedureEntry, ProcedurePlan, State
+from escape_hw.deprecation import renamed_text, warn_renamed
+from escape_hw.remote.state import Geometry, LogLine, ProcedureEntry, State
 from escape_hw.streams.ring import Sample
 
 __all__ = ["STREAMS", "DataSource", "Sample"]
@@ -40,23 +41,13 @@ class DataSource(Protocol):
         """The procedures with their parameters."""
         ...
 
-    def plan(self, procedure: str, arguments: Arguments) -> ProcedurePlan:
-        """Plan a procedure; nothing moves.
-
-        Raises
-        ------
-        ConfigError
-            An argument is unknown or out of range.
-        """
-        ...
-
 
 #: Streams by name, with the shape and unit of an entry. Frame streams have one entry per frame.
 STREAMS: dict[str, str] = {
     # per frame
     "frames": "raw frame of the sensor's camera (rows, columns), counts; meta 'full_scale': saturation",
     "slopes": "(n_slopes,), pixel",
-    "modes": "reconstructed residual (n_modes,), nm rms wavefront; closed loop only",
+    "residual_modes": "reconstructed residual (n_modes,), nm rms wavefront; closed loop only",
     "commands": "command of the mirror (n_act,), fraction of full stroke",
     "psf": "science frame (rows, columns), counts",
     # on change
@@ -78,3 +69,14 @@ STREAMS: dict[str, str] = {
     "gains_rounds": "gain by round of the bootstrap (n_rounds, n_modes)",
     "residual": "rms residual of the last frames (n,), nm; the newest last",
 }
+
+#: Names of version 0.1.0 and their present names.
+RENAMED_STREAMS = {"modes": "residual_modes"}
+
+
+def present_stream(name: str) -> str:
+    """The present name of a stream; an old name is reported with a deprecation message."""
+    present = RENAMED_STREAMS.get(name, name)
+    if present != name:
+        warn_renamed(renamed_text(f"the stream '{name}'", f"'{present}'"))
+    return present

@@ -23,7 +23,8 @@ from escape_hw.supervision import BackgroundThread
 
 log = logging.getLogger(__name__)
 
-_POLL_MS = 500
+#: Interval of heartbeats, seconds.
+_HEARTBEAT_S = 0.5
 #: Identifier of heartbeats, whose reply no caller waits for.
 _HEARTBEAT_ID = b"0"
 #: Largest reply that is accepted, bytes.
@@ -44,7 +45,7 @@ class ClientTransport:
     on_event
         Called with topic and document of every event, in the thread of the sockets.
     heartbeat
-        Returns the message to send every ``heartbeat_s`` seconds, or ``None``. Its argument is whether the
+        Returns the message to send twice a second, or ``None``. Its argument is whether the
         server refused the last one.
     keys
         The server's public key, this client's public and secret key; ``None`` on the same computer.
@@ -55,18 +56,14 @@ class ClientTransport:
         endpoint: Endpoint,
         on_event: Callable[[str, dict[str, Any]], object],
         heartbeat: Callable[[bool], Mapping[str, Any] | None],
-        heartbeat_s: float = 0.5,
         keys: Keys | None = None,
     ) -> None:
-        self._on_event, self._heartbeat, self._heartbeat_s = on_event, heartbeat, heartbeat_s
+        self._on_event, self._heartbeat = on_event, heartbeat
         self._context = zmq.Context()
         self._requests = self._socket(zmq.DEALER, endpoint.requests, keys)
         self._events = self._socket(zmq.SUB, endpoint.events, keys)
         self._events.setsockopt(zmq.SUBSCRIBE, b"")
-        self._wake_receiver, self._wake_sender = (
-            self._context.socket(zmq.PAIR),
-            self._context.socket(zmq.PAIR),
-        )
+        self._wake_receiver, self._wake_sender = (self._context.socket(zmq.PAIR) for _ in range(2))
         self._wake_receiver.bind("inproc://wake")
         self._wake_sender.connect("inproc://wake")
         self._lock = threading.Lock()
@@ -139,7 +136,7 @@ class ClientTransport:
             poller.register(socket, zmq.POLLIN)
         last_heartbeat_s = 0.0
         while not self._ending:
-            ready = dict(poller.poll(min(_POLL_MS, int(1000 * self._heartbeat_s))))
+            ready = dict(poller.poll(int(1000 * _HEARTBEAT_S)))
             if self._wake_receiver in ready:
                 self._wake_receiver.recv()
             self._send_all()
@@ -148,16 +145,11 @@ class ClientTransport:
                 self._receive_events()
             if self._requests in ready:
                 self._receive_reply()
-            if (
-                time.monotonic() - last_heartbeat_s > self._heartbeat_s
-                and (message := self._next_heartbeat()) is not None
-            ):
-                last_heartbeat_s = time.monotonic()
-                self._send(_HEARTBEAT_ID, json.dumps(message).encode())
-
-    def _next_heartbeat(self) -> Mapping[str, Any] | None:
-        refused, self._heartbeat_refused = self._heartbeat_refused, False
-        return self._heartbeat(refused)
+            if time.monotonic() - last_heartbeat_s > _HEARTBEAT_S:
+                refused, self._heartbeat_refused = self._heartbeat_refused, False
+                if (message := self._heartbeat(refused)) is not None:
+                    last_heartbeat_s = time.monotonic()
+                    self._send(_HEARTBEAT_ID, json.dumps(message).encode())
 
     def _send_all(self) -> None:
         while True:

@@ -86,17 +86,14 @@ class RunContent:
 
     def estimates(self) -> dict[str, RegistrationEstimate]:
         """Registrations by the heading of their column."""
-        found = {self.columns[n]: r.registration for n, r in self.calibrations.items() if r.registration}
-        return found
+        return {self.columns[n]: r.registration for n, r in self.calibrations.items() if r.registration}
 
     def partial(self) -> bool:
         """True when any part of the run was aborted."""
-        return (
-            any(result.partial for result in self.calibrations.values())
-            or any(loop.partial for loop in self.loops.values())
-            or any(gains.partial for gains in self.gains.values())
-            or bool(self.document.get("partial"))
-        )
+        results: list[CalibrationResult | LoopResult | GainsResult] = [
+            *self.calibrations.values(), *self.loops.values(), *self.gains.values()
+        ]  # fmt: skip
+        return bool(self.document.get("partial")) or any(result.partial for result in results)
 
 
 def read_run(folder: Path | str) -> RunContent:
@@ -154,26 +151,24 @@ def _add_product(run: RunContent, name: str, path: Path, label: Mapping[str, str
     run.digests[name], run.kinds[name] = digest, str(kind)
     if kind == KIND_MATRIX:
         result = load_matrix(path).result
-        unique = _unique_label(
-            run.calibrations, label.get("label") or METHOD_LABELS.get(result.matrix.method, name), name
-        )
+        unique = _label(run.calibrations, label, result.matrix.method, name)
         run.calibrations[unique] = result
         run.names[unique] = name
         run.measured_labels[unique] = label.get("measured", METHOD_LABELS["docrime"])
         run.columns[unique] = label.get("column", "" if unique == "ESCAPE" else unique)
     elif kind == KIND_PSF:
         loop = load_loop(path).result
-        run.loops[
-            _unique_label(run.loops, label.get("label") or METHOD_LABELS.get(loop.method, name), name)
-        ] = loop
+        run.loops[_label(run.loops, label, loop.method, name)] = loop
     elif kind == KIND_GAINS:
         found = load_gains(path).result
-        run.gains[label.get("label") or METHOD_LABELS.get(found.method, name)] = found
+        run.gains[_label(run.gains, label, found.method, name)] = found
     elif kind != KIND_TELEMETRY:
         raise ProductError(f"{path}: its kind is {kind!r}; this version reads IM, PSF, OG and TELEM")
 
 
-def _unique_label(used: Mapping[str, object], label: str, name: str) -> str:
+def _label(used: Mapping[str, object], stated: Mapping[str, str], method: str, name: str) -> str:
+    """The stated label of a product, or that of its method; unique among those used."""
+    label = stated.get("label") or METHOD_LABELS.get(method, name)
     return label if label not in used else f"{label} ({name})"
 
 

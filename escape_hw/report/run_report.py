@@ -25,12 +25,7 @@ REPORT = "report.html"
 
 
 def write_report(folder: Path | str) -> Path:
-    """Build a run folder's report from its ``result.json`` and products.
-
-    Returns
-    -------
-    Path
-        The page written.
+    """Build a run folder's report from its ``result.json`` and products; returns the page.
 
     Raises
     ------
@@ -70,9 +65,7 @@ def render_page(run: RunContent) -> str:
         f"<h1>{html.escape(title)}</h1>",
         f'<p class="lead">{html.escape(lead)}</p>',
         html.key_values(_key_numbers(run)),
-    ]
-    parts += [
-        _criteria_section(document),
+        html.section("Criteria", html.criteria_list(document.get("criteria") or [])),
         _registration_section(run),
         _gains_section(run),
         _loops_section(run),
@@ -81,8 +74,8 @@ def render_page(run: RunContent) -> str:
         _matrices_section(run),
         _sky_time_section(run),
         _bench_section(run),
+        _origin_section(run),
     ]
-    parts.append(_origin_section(run))
     return html.page(title, banners, [part for part in parts if part])
 
 
@@ -120,10 +113,6 @@ def _track_key_numbers(document: dict[str, Any]) -> dict[str, str]:
     if document.get("strehl") is not None:
         found["Strehl ratio, peak, mean"] = f"{100 * document['strehl']:.1f} %"
     return found
-
-
-def _criteria_section(document: dict[str, Any]) -> str:
-    return html.section("Criteria", html.criteria_list(document.get("criteria") or []))
 
 
 def _registration_section(run: RunContent) -> str:
@@ -191,11 +180,9 @@ def _loops_section(run: RunContent) -> str:
                 "Residual wavefront seen by the sensor, from the closing of the loop on; logarithmic.",
             )
         )
-    scans = run.document.get("scans") or {}
-    if scans:
-        parts.append(
-            html.figure("gains", figures_bench.gain_scan(scans), "Search for each matrix's own best gain.")
-        )
+    if scans := run.document.get("scans"):
+        caption = "Search for each matrix's own best gain."
+        parts.append(html.figure("gains", figures_bench.gain_scan(scans), caption))
     return html.section("Closed loop", *parts)
 
 
@@ -289,10 +276,11 @@ def _mirror_figure(run: RunContent, command: NDArray[np.float64]) -> Figure | No
 
 def _bench_section(run: RunContent) -> str:
     parts = []
-    calibration = next((r for r in run.calibrations.values() if r.mean_frame is not None), None)
-    if calibration is not None and calibration.mean_frame is not None:
-        drawing = figures_bench.sensor_frame(calibration.mean_frame, calibration.grid, "mean frame")
-        parts.append(html.figure("mean", drawing, "Mean sensor frame and what was found on it."))
+    for calibration in run.calibrations.values():
+        if calibration.mean_frame is not None:
+            drawing = figures_bench.sensor_frame(calibration.mean_frame, calibration.grid, "mean frame")
+            parts.append(html.figure("mean", drawing, "Mean sensor frame and what was found on it."))
+            break
     label, loop = next(reversed(run.loops.items()), ("", None))
     if loop is not None and loop.last_frame is not None:
         drawing = figures_bench.sensor_frame(loop.last_frame, None, "one frame")
@@ -327,14 +315,7 @@ _MODES = 5
 
 
 def write_picture(folder: Path | str, path: Path) -> Path:
-    """Draw the picture of a run folder as PNG.
-
-    Parameters
-    ----------
-    folder
-        A run with at least one matrix and one closed loop, such as ``escape reproduce`` leaves.
-    path
-        File to write.
+    """Draw the matrices and PSFs of a run folder, such as ``escape reproduce`` leaves, as PNG.
 
     Raises
     ------

@@ -131,10 +131,8 @@ def best_table(document: Mapping[str, Any]) -> tables.Table:
     """Three Strehl ratios and the best parameters of every variant."""
     best = document["best"]
     keys = list(next(iter(best.values()))["values"]) if best else []
-    headings = (
-        "Matrix", "Strehl, peak [%]", "Strehl, OTF [%]", "Strehl, encircled [%]",
-        *(PARAMETER_LABELS.get(key, key) for key in keys), "closed",
-    )  # fmt: skip
+    labels = (PARAMETER_LABELS.get(key, key) for key in keys)
+    headings = ("Matrix", *tables.STREHL_HEADINGS, *labels, "closed")
     rows = []
     for label, one in best.items():
         ratios = (

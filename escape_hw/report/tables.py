@@ -38,6 +38,9 @@ TITLES = {
 }
 
 
+STREHL_HEADINGS = ("Strehl, peak [%]", "Strehl, OTF [%]", "Strehl, encircled [%]")
+
+
 @dataclass(frozen=True, slots=True)
 class Table:
     """A table of text: headings and rows, the first column naming the row; numbers in the others."""
@@ -49,12 +52,10 @@ class Table:
 
 def format_with_error(value: Estimate) -> str:
     """Value and standard error, both rounded to the error's second digit."""
-    if not math.isfinite(value.value) or not math.isfinite(value.sigma):
+    if not math.isfinite(value.value) or not math.isfinite(value.sigma) or value.sigma >= 1e6:
         return f"{value.value:.4g} ± {value.sigma:.2g}".replace("-", "−")
     if value.sigma <= 0:
         return f"{value.value:.4g}".replace("-", "−")
-    if value.sigma >= 1e6:
-        return f"{value.value:.4g} ± {value.sigma:.2g}".replace("-", "−")
     digits = max(0, 1 - math.floor(math.log10(value.sigma)))
     # Adding 0.0 turns a rounded −0.0 into 0.0.
     return f"{round(value.value, digits) + 0.0:.{digits}f} ± {value.sigma:.{digits}f}".replace("-", "−")
@@ -121,25 +122,12 @@ def _format_pull(value: Estimate, truth: float) -> str:
 
 def strehl_table(loops: Mapping[str, LoopResult]) -> Table:
     """Three Strehl ratios with errors, gain, residual and stability of every loop."""
-    headings = (
-        "Matrix",
-        "Strehl, peak [%]",
-        "Strehl, OTF [%]",
-        "Strehl, encircled [%]",
-        "gain",
-        "rms [nm]",
-        "loop",
-    )
+    headings = ("Matrix", *STREHL_HEADINGS, "gain", "rms [nm]", "loop")
     rows = []
     for label, loop in loops.items():
         strehl = loop.strehl
-        ratios = (
-            ("–", "–", "–")
-            if strehl is None
-            else tuple(
-                format_percent(value).strip(" %") for value in (strehl.peak, strehl.otf, strehl.encircled)
-            )
-        )
+        values = (None,) * 3 if strehl is None else (strehl.peak, strehl.otf, strehl.encircled)
+        ratios = ("–" if value is None else format_percent(value).strip(" %") for value in values)
         state = f"stable {loop.frames / loop.rate_hz:.0f} s" if loop.stable else "UNSTABLE"
         if loop.partial:
             state += ", aborted"
@@ -155,14 +143,8 @@ def _format_gain(loop: LoopResult) -> str:
 def rounds_table(result: GainsResult) -> Table:
     """Rounds of a bootstrap of optical gains: poke, frames, mean gain, its change, cost."""
     headings = (
-        "Round",
-        "poke [% of stroke]",
-        "frames",
-        "mean gain",
-        "change [%]",
-        "Strehl lost [%]",
-        "Strehl [%]",
-    )
+        "Round", "poke [% of stroke]", "frames", "mean gain", "change [%]", "Strehl lost [%]", "Strehl [%]",
+    )  # fmt: skip
     rows = []
     for number, one in enumerate(result.rounds, 1):
         gains = one.gains

@@ -61,16 +61,7 @@ class CommandGuard:
     If the last shape breaks a rule (see :meth:`reset`), no single command can satisfy both that rule and
     the slew rule. The slew rule has priority, and each command reduces the violation of the other rule.
 
-    Parameters
-    ----------
-    device
-        Device name for error messages.
-    n_act
-        Number of actuators.
-    limits
-        The limits to enforce.
-    pairs
-        Neighbour pairs ``(n_pairs, 2)``, see :func:`~escape_hw.safety.limits.neighbour_pairs`.
+    ``pairs``: neighbour pairs ``(n_pairs, 2)``, see :func:`~escape_hw.safety.limits.neighbour_pairs`.
 
     Raises
     ------
@@ -97,7 +88,7 @@ class CommandGuard:
         self._mean_weights = self._enabled / n_enabled if n_enabled else np.zeros(n_act)
         self.last = _read_only(np.zeros(n_act))
         # Imported here because numba is slow to import and reading a configuration does not need it.
-        from escape_hw.safety.limit_check import obeys_limits
+        from escape_hw.safety.compiled_check import obeys_limits
 
         self._obeys_limits = obeys_limits
         # The stroke limit is exact, the others have a tolerance; a rule that is off has an infinite limit.
@@ -117,10 +108,7 @@ class CommandGuard:
     def validate(self, command: ArrayLike) -> NDArray[np.float64]:
         """Check type, shape and finiteness.
 
-        Returns
-        -------
-        ndarray of float64, ``(n_act,)``
-            A new C-contiguous array.
+        Returns a new C-contiguous array ``(n_act,)``, float64.
 
         Raises
         ------
@@ -261,9 +249,7 @@ class CommandGuard:
     ) -> tuple[NDArray[np.float64], int, int, float, float]:
         """Bring a shape within every rule except slew.
 
-        Returns
-        -------
-        legal, clipped, disabled, scale, mean_removed
+        Returns the legal shape, and as in :class:`GuardReport` clipped, disabled, scale and mean removed.
         """
         lim = self.limits
         disabled = int(np.count_nonzero(requested[self._disabled]))

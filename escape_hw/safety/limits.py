@@ -8,6 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+#: Largest distance of adjacent actuators, in units of the median distance to the nearest one.
+_MAX_PAIR_DISTANCE = 1.3
+
 
 @dataclass(frozen=True, slots=True)
 class MirrorLimits:
@@ -85,8 +88,8 @@ def neighbour_pairs(layout: NDArray[np.bool_]) -> NDArray[np.intp]:
     return np.concatenate(pairs)
 
 
-def nearest_pairs(positions: NDArray[np.float64], max_distance: float = 1.3) -> NDArray[np.intp]:
-    """Pairs of adjacent actuators by distance, for any layout.
+def nearest_pairs(positions: NDArray[np.float64]) -> NDArray[np.intp]:
+    """Pairs of adjacent actuators, up to 1.3 median distances to the nearest actuator apart.
 
     On a square grid these are the pairs of :func:`neighbour_pairs`, because a diagonal is 1.41 pitches long.
 
@@ -94,8 +97,6 @@ def nearest_pairs(positions: NDArray[np.float64], max_distance: float = 1.3) -> 
     ----------
     positions
         Actuator positions ``(n_act, 2)``.
-    max_distance
-        Largest distance of a pair, in units of the median distance to the nearest actuator.
 
     Returns
     -------
@@ -118,4 +119,4 @@ def nearest_pairs(positions: NDArray[np.float64], max_distance: float = 1.3) -> 
     if not nearest.min() > 0:
         one = int(nearest.argmin())
         raise ValueError(f"actuators {one} and {int(distance[one].argmin())} have the same position")
-    return np.argwhere(np.triu(distance <= max_distance * np.median(nearest))).astype(np.intp)
+    return np.argwhere(np.triu(distance <= _MAX_PAIR_DISTANCE * np.median(nearest))).astype(np.intp)

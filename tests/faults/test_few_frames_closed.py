@@ -54,11 +54,11 @@ def test_right_within_its_errors_whatever_the_loop_does(closed_loop, name):
         assert found.measured is None
         assert found.matrix.metrics["frames"] == FRAMES
         if name == "commands cut by the limits":
-            assert found.matrix.metrics["shortened"] > 0
+            assert found.matrix.metrics["clipped_pokes"] > 0
             assert any("limits shortened" in note for note in found.notes)
         elif name != "a matrix half as large":
             # That one doubles the loop's gain, whose commands may reach the limits, too.
-            assert found.matrix.metrics["shortened"] == 0
+            assert found.matrix.metrics["clipped_pokes"] == 0
         pulls.append(pull(found))
     assert np.abs(pulls).max() < 5
     assert np.mean(np.square(pulls)) < 3

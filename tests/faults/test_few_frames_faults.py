@@ -36,7 +36,7 @@ def test_right_within_its_errors(name):
         found = measured(*FAULTS[name], seed=seed, broken=(18, 25) if "dead" in name else ())
         assert found.registration.converged, found.registration.warnings
         if name == "clipped pokes":
-            assert found.matrix.metrics["shortened"] > FRAMES / 2
+            assert found.matrix.metrics["clipped_pokes"] > FRAMES / 2
         pulls.append((found.registration.registration.to_array() - PLANTED) / found.registration.sigma)
     assert np.abs(pulls).max() < 5
     # Under this vibration, four times the usual, the scalings come out 0.2 % too small, 2.5 errors.

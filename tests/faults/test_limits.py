@@ -34,7 +34,7 @@ def test_docrime_with_shortened_pokes(good, name):
         limits = bench.dm.limits
         m2c = run.result.matrix.m2c
         assert_flat(bench)
-    assert run.result.matrix.metrics["shortened"] > 300
+    assert run.result.matrix.metrics["clipped_pokes"] > 300
     assert np.abs(reached).max() <= limits.max_stroke
     assert np.abs(np.diff(reached, axis=0)).max() <= (limits.max_slew or 2) + 1e-9
     # What reached the mirror lies in the span of the modes: nothing else can pass for their response.

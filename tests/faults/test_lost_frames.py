@@ -51,8 +51,8 @@ def test_the_same_matrix_within_its_noise(good, runs, loss):
         assert chi2 == pytest.approx(without, abs=0.3)
         assert chi2 == pytest.approx(1, abs=0.35)
         assert gain == pytest.approx(1, abs=0.02)
-        delay = runs[0.0][0].result.response.delay
-        assert run.result.response.delay == pytest.approx(delay, abs=0.02)
+        delay = runs[0.0][0].result.response.delay_frames
+        assert run.result.response.delay_frames == pytest.approx(delay, abs=0.02)
 
 
 def test_what_is_lost_shows_in_the_errors(runs):
@@ -81,7 +81,7 @@ def test_overlooked_losses_would_be_seen(good, runs, monkeypatch):
     run = measure(good, 0.1, 3)
     right = runs[0.1][0].result
     assert np.median(run.result.matrix.sigma) > 2 * np.median(right.matrix.sigma)
-    assert abs(run.result.response.delay - right.response.delay) > 0.02
+    assert abs(run.result.response.delay_frames - right.response.delay_frames) > 0.02
 
 
 def test_every_tenth_frame_lost_by_the_camera(good):

@@ -23,7 +23,7 @@ def test_the_same_matrix_as_docrime(good):
     assert gain == pytest.approx(1.0, abs=0.02)
     assert 0.5 < np.mean(np.square(error) / (np.square(found.sigma) + np.square(truth.sigma))) < 2
     assert np.linalg.norm(error) < 0.08 * np.linalg.norm(truth.data)
-    assert result.response.delay == pytest.approx(good.run.result.response.delay, abs=0.05)
+    assert result.response.delay_frames == pytest.approx(good.run.result.response.delay_frames, abs=0.05)
     assert found.snr().min() > 3
 
 

@@ -13,7 +13,7 @@ from small_system import configuration
 
 from escape_hw.api.registration import PARAMETERS, Registration
 from escape_hw.api.results import Estimate, TemporalResponse
-from escape_hw.calibration.tracking.exchange import invert_matrix
+from escape_hw.calibration.loop.control import invert_matrix
 from escape_hw.calibration.tracking.tracker import track
 from escape_hw.cli import main
 from escape_hw.errors import Aborted, CalibrationError, ConfigError
@@ -202,8 +202,8 @@ def test_a_wrong_delay_is_told_and_the_measured_one_taken(start):
         found = followed(bench, start, 6, response=late)
     alarms = [alarm for alarm in found.alarms if alarm.kind == "delay"]
     assert len(alarms) == 1
-    assert f"instead of {late.delay:.2f}" in alarms[0].text
-    assert found.latest.response.delay == pytest.approx(start.response.delay, abs=0.1)
+    assert f"instead of {late.delay_frames:.2f}" in alarms[0].text
+    assert found.latest.response.delay_frames == pytest.approx(start.response.delay_frames, abs=0.1)
     error = np.array([found.rows[name][-1] for name in PARAMETERS]) - truth
     assert (np.abs(error[:3]) < [3.0, 3.0, 0.15]).all()
     assert found.optical_gain.mean() == pytest.approx(1, abs=0.1)

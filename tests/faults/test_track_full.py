@@ -83,6 +83,6 @@ def test_a_wrong_delay_is_told_and_the_registration_kept(start):
     found = followed(start, lambda twin: None, response=late, seconds=5)
     alarms = [alarm for alarm in found.alarms if alarm.kind == "delay"]
     assert len(alarms) == 1
-    assert found.latest.response.delay == pytest.approx(start.response.delay, abs=0.1)
+    assert found.latest.response.delay_frames == pytest.approx(start.response.delay_frames, abs=0.1)
     apart = found.column("shift_x")[-1] - start.registration.registration.shift_x
     assert abs(apart) < 4 * found.column("shift_x_sigma")[-1]

@@ -7,12 +7,14 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from PySide6.QtCore import QCoreApplication, QEvent
+from PySide6.QtWidgets import QCheckBox, QComboBox, QLineEdit
 
 from escape_gui.client.session import Session
 from escape_gui.main_window import MainWindow
 from escape_gui.panels import PANELS
 from escape_gui.panels.base import Panel
 from escape_gui.settings import Settings
+from escape_gui.widgets.argument_form import ArgumentForm
 
 
 def settle() -> None:
@@ -42,3 +44,15 @@ def dispose(window: MainWindow) -> None:
     """Close and delete a window."""
     window.close()
     window.deleteLater()
+
+
+def enter_argument(form: ArgumentForm, name: str, text: str) -> None:
+    """Enter a value into a field of a form."""
+    field = form.fields[name]
+    if isinstance(field, QLineEdit):
+        field.setText(text)
+        field.textEdited.emit(text)
+    elif isinstance(field, QComboBox):
+        field.setCurrentText(text)
+    elif isinstance(field, QCheckBox):
+        field.setChecked(text == "True")

@@ -203,10 +203,10 @@ class ScriptedSource:
         n_slopes = 2 * sum(row.count("1") for row in self.geometry_data.valid)
         geometry = self.geometry_data
         n_act = sum(row.count("1") for row in geometry.layout) or len(geometry.positions_m)
-        self.push("frames", spots(self.geometry_data, seed=seed), top=1023.0)
+        self.push("frames", spots(self.geometry_data, seed=seed), full_scale=1023.0)
         self.push("slopes", rng.normal(0, 0.4, n_slopes))
         self.push("commands", rng.normal(0, 0.1, n_act))
-        self.push("modes", rng.normal(0, 20, self.geometry_data.n_modes))
+        self.push("residual_modes", rng.normal(0, 20, self.geometry_data.n_modes))
         self.push("psf", speckles(seed))
         self.push("model_psf", speckles(seed, strehl=1.0))
         latencies = rng.gamma(60, 5.2, 4000)
@@ -241,13 +241,6 @@ class ScriptedSource:
         """The procedures set by the test."""
         return self.entries
 
-    def plan(self, procedure: str, arguments: Arguments) -> ProcedurePlan:
-        """A plan with the requested number of frames."""
-        frames = int(arguments.get("frames") or 1000)
-        return ProcedurePlan(
-            name=procedure, arguments=dict(arguments), frames=frames, seconds=frames / 500, stroke=0.02
-        )
-
 
 class ScriptedControl:
     """Records every request; raises if ``refuse`` is set."""
@@ -276,4 +269,7 @@ class ScriptedControl:
     def plan(self, procedure: str, arguments: Arguments) -> ProcedurePlan:
         """A plan."""
         self._note("plan", procedure=procedure, arguments=arguments)
-        return ScriptedSource().plan(procedure, arguments)
+        frames = int(arguments.get("frames") or 1000)
+        return ProcedurePlan(
+            name=procedure, arguments=dict(arguments), frames=frames, seconds=frames / 500, stroke=0.02
+        )

@@ -9,7 +9,7 @@ from pathlib import Path
 import fake_results as fake
 import numpy as np
 import pytest
-from gui_windows import dispose, show_window
+from gui_windows import dispose, enter_argument, show_window
 from PySide6.QtCore import QPoint, Qt
 from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QApplication, QPushButton
@@ -22,7 +22,7 @@ from escape_gui.panels.modes import LIVE_LABEL, ModesPanel
 from escape_gui.panels.procedure import ProcedurePanel
 from escape_gui.panels.sprint import SprintPanel
 from escape_gui.settings import Settings
-from escape_gui.widgets.images.map_tiles import best_columns
+from escape_gui.widgets.mode_maps import best_columns
 from escape_hw.api.registration import TO_STREAM_UNITS
 from escape_hw.io.documents import calibration_document
 from escape_hw.io.fits.matrix import save_matrix
@@ -157,7 +157,7 @@ def test_a_click_shows_the_mode_in_every_matrix(calibrate, source, tmp_path):
     QTest.mouseClick(mosaic._view.viewport(), Qt.MouseButton.LeftButton, pos=middle.toPoint())
     until(lambda: mosaic.mode == 4, calibrate)
     assert panel.detail.isVisible()
-    assert panel.detail.titles == (
+    assert tuple(one.title for one in panel.detail.tiles) == (
         "push-pull", "DO-CRIME", "ESCAPE", "ESCAPE − push-pull", "Standard error of DO-CRIME",
         "SNR of DO-CRIME",
     )  # fmt: skip
@@ -266,8 +266,8 @@ def test_a_procedure_is_started_from_the_form(calibrate, source, control):
     look(calibrate)
     assert [panel.choice.itemText(k) for k in range(panel.choice.count())] == ["ESCAPE", "Optical gains"]
     assert not panel.start.isEnabled()
-    panel.form.set_value("frames", "200")
-    panel.form.set_value("pokes", "anticorrelated")
+    enter_argument(panel.form, "frames", "200")
+    enter_argument(panel.form, "pokes", "anticorrelated")
     until(panel.start.isEnabled, calibrate)
     arguments = {"frames": 200, "pokes": "anticorrelated"}
     assert ("plan", {"procedure": "escape", "arguments": arguments}) in control.asked
@@ -282,7 +282,7 @@ def test_an_invalid_form_starts_nothing(calibrate, control):
     panel = calibrate.panels["procedure"]
     look(calibrate)
     until(panel.start.isEnabled, calibrate)
-    panel.form.set_value("frames", "zero")
+    enter_argument(panel.form, "frames", "zero")
     assert not panel.start.isEnabled()
     press(panel.check)
     assert "'zero' is no number" in panel.plan.text()
@@ -351,7 +351,7 @@ def test_new_matrices_are_offered_to_the_form(calibrate, source):
     source.change(products=tuple(ProductEntry(name=name, kind="matrix", path="/x.fits") for name in names))
     look(calibrate)
     assert box.currentText() == "second"
-    panel.form.set_value("im", "first")
+    enter_argument(panel.form, "im", "first")
     source.change(
         products=(*source.state.products, ProductEntry(name="third", kind="matrix", path="/x.fits"))
     )

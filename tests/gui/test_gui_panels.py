@@ -25,7 +25,7 @@ from escape_gui.panels.loop import LoopPanel
 from escape_gui.panels.mirror import MirrorPanel
 from escape_gui.panels.performance import PerformancePanel
 from escape_gui.panels.psf import PsfPanel
-from escape_gui.widgets.controls.buttons import HOLD_MS
+from escape_gui.widgets.controls import HOLD_MS
 from escape_hw.errors import StorageError
 from escape_hw.remote.state import (
     DeviceHealth,
@@ -108,7 +108,7 @@ def test_camera_counts_and_hatches_saturation(window: MainWindow, source: Script
     camera = panel_of(window, CameraPanel)
     frame = np.zeros((400, 400), np.uint16)
     frame[7, 9] = 1023
-    source.push("frames", frame, top=1023.0)
+    source.push("frames", frame, full_scale=1023.0)
     source.change(illumination=Illumination(saturated=0.0321, peak=1.0))
     camera._histogram_due = 0.0
     window.update_timer.tick(force=True)

@@ -14,13 +14,13 @@ from pytestqt.qtbot import QtBot
 from scripted import ScriptedControl, disc, rows_of, secondary
 
 from escape_gui.app import require_display
-from escape_gui.client.session import RequestSender
+from escape_gui.client.session import EmptySource, Session
 from escape_gui.settings import Settings, load_settings, save_settings
 from escape_gui.theme import PALETTES, SCALES, Palette, Theme
 from escape_gui.views.images import MAP_GAP, ActuatorImage, RadialProfile, mask_from_rows, slope_map_pair
 from escape_gui.views.loop_form import LoopSettingsEdit
-from escape_gui.widgets.images.quiver import outline_points
-from escape_gui.widgets.plots.plot import TimeSeriesBuffer
+from escape_gui.widgets.images import outline_points
+from escape_gui.widgets.plots import TimeSeriesBuffer
 from escape_hw.cli.app import run
 from escape_hw.errors import ConfigError
 from escape_hw.remote.state import Geometry, LoopState
@@ -117,13 +117,13 @@ def test_a_missing_settings_file_gives_no_warning(tmp_path: Path) -> None:
 # ---------------------------------------------------------------- requests
 @pytest.fixture
 def requests(control: ScriptedControl):
-    requests = RequestSender(control)
-    yield requests
-    requests.close()
-    requests.deleteLater()
+    session = Session()
+    session.set_source(EmptySource(), control)
+    yield session
+    session.close()
 
 
-def test_answers_are_delivered_in_the_windows_thread(requests: RequestSender, qtbot: QtBot) -> None:
+def test_answers_are_delivered_in_the_windows_thread(requests: Session, qtbot: QtBot) -> None:
     threads: list[threading.Thread] = []
     asked = threading.current_thread()
 
@@ -142,7 +142,7 @@ def test_answers_are_delivered_in_the_windows_thread(requests: RequestSender, qt
 
 
 def test_safety_does_not_wait_behind_a_slow_question(
-    requests: RequestSender, control: ScriptedControl, qtbot: QtBot
+    requests: Session, control: ScriptedControl, qtbot: QtBot
 ) -> None:
     go_on = threading.Event()
     requests.ask("check", lambda server: go_on.wait(20))
@@ -153,7 +153,7 @@ def test_safety_does_not_wait_behind_a_slow_question(
 
 
 def test_a_failure_is_reported_to_the_caller(
-    requests: RequestSender, control: ScriptedControl, qtbot: QtBot
+    requests: Session, control: ScriptedControl, qtbot: QtBot
 ) -> None:
     control.refuse = "the loop is open"
     heard: list[str] = []
@@ -164,7 +164,8 @@ def test_a_failure_is_reported_to_the_caller(
 
 
 def test_answers_after_closing_are_discarded(control: ScriptedControl, qtbot: QtBot) -> None:
-    requests = RequestSender(control)
+    requests = Session()
+    requests.set_source(EmptySource(), control)
     go_on, heard = threading.Event(), []
     requests.ask("slow", lambda server: go_on.wait(20), heard.append)
     go_on.set()
@@ -173,7 +174,6 @@ def test_answers_after_closing_are_discarded(control: ScriptedControl, qtbot: Qt
     qtbot.wait(50)
     assert heard == []
     assert control.asked == []
-    requests.deleteLater()
 
 
 # ---------------------------------------------------------------- pictures

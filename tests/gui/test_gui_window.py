@@ -24,10 +24,10 @@ from escape_gui.client.session import EmptySource, Session
 from escape_gui.main_window import MainWindow
 from escape_gui.panels.procedure import ProcedurePanel
 from escape_gui.settings import Settings, load_settings
-from escape_gui.widgets.controls.status_indicator import Level
-from escape_gui.widgets.images.image_viewer import ImageViewer
+from escape_gui.widgets.controls import Level
+from escape_gui.widgets.images import ImageViewer
+from escape_gui.window.docks import WORKSPACES
 from escape_gui.window.header import HeaderBar
-from escape_gui.window.workspaces import WORKSPACES
 from escape_hw.config.loader import load_system
 from escape_hw.remote.source import DataSource
 from escape_hw.remote.state import (

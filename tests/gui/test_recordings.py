@@ -19,7 +19,7 @@ from escape_gui.main_window import MainWindow
 from escape_gui.panels import PANELS
 from escape_gui.replay.source import ReplaySource
 from escape_gui.settings import Settings
-from escape_gui.widgets.controls.status_indicator import Level
+from escape_gui.widgets.controls import Level
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import serving
-from gui_windows import dispose
+from gui_windows import dispose, enter_argument
 from PySide6.QtCore import Qt
 from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QApplication, QPushButton
@@ -70,7 +70,7 @@ class Operator:
         self.until(lambda: form.choice.findData(name) >= 0, "procedures are offered")
         form.choice.setCurrentIndex(form.choice.findData(name))
         for key, text in arguments.items():
-            form.form.set_value(key, text)
+            enter_argument(form.form, key, text)
         self.until(form.start.isEnabled, f"{name} is planned: {form.plan.text()}")
 
     def run(self, name: str, **arguments: str) -> FinishedRun:

@@ -41,7 +41,7 @@ def test_unbiased_for_any_controller_and_least_squares_is_not(name):
         pulls.append((gain - 1) / np.hypot(found.gain_sigma, own))
         squares.append(np.mean(np.square((found.matrix - gain * run.truth) / found.sigma)))
         modes.append([gain_of(a, b) for a, b in zip(found.matrix.T, run.truth.T, strict=True)])
-        delays.append(found.response.delay)
+        delays.append(found.response.delay_frames)
         plain.append(gain_of(run.fit(closed=False).matrix, run.truth))
     error = np.std(gains) / np.sqrt(SEEDS)
     assert abs(np.mean(gains) - 1) < 4 * error

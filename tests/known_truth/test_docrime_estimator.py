@@ -47,7 +47,7 @@ def test_matrix_response_and_errors():
     assert np.linalg.norm(s.matrix - truth) < 0.1 * np.linalg.norm(plain.matrix - truth)
     assert s.response.weights == pytest.approx(RESPONSE, abs=0.01)
     assert np.abs((s.response.weights - RESPONSE) / s.response.sigma).max() < 4
-    assert s.response.delay == pytest.approx(RESPONSE @ np.arange(5), abs=0.02)
+    assert s.response.delay_frames == pytest.approx(RESPONSE @ np.arange(5), abs=0.02)
 
 
 @pytest.mark.parametrize("turbulence", [0.02, 0.3])

@@ -53,7 +53,7 @@ def test_planted_matrices_and_delays_are_recovered(delay, frames):
         gain, z = split(s, truth)
         gains.append(gain)
         errors.append(z)
-        delays.append(s.response.delay)
+        delays.append(s.response.delay_frames)
         weights.append((s.response.weights - RESPONSES[delay]) / s.response.sigma)
         assert s.response.weights.sum() == pytest.approx(1)
     # Five standard deviations of chi-squared.
@@ -97,7 +97,7 @@ def test_the_gain_is_known_better_from_more_frames():
 def test_the_plain_estimators_response_does_not_suffer_from_the_turbulence(frames):
     # It comes from frame differences, however long the run.
     found = [solve(*run(seed, frames=frames)[:2], order=0).response for seed in range(8)]
-    delays = [response.delay for response in found]
+    delays = [response.delay_frames for response in found]
     assert np.mean(delays) == pytest.approx(2, abs=0.05)
     assert np.std(delays) < 0.12
     z = np.array([(response.weights - RESPONSES[2.0]) / response.sigma for response in found])

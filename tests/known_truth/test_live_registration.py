@@ -7,10 +7,10 @@ import pytest
 from small_pyramid import small as small_pyramid
 from small_system import configuration
 
+from escape_hw.calibration.acquisition.aligned_telemetry import TelemetryBuffer
 from escape_hw.calibration.acquisition.pokes import compute_poke_amplitudes
 from escape_hw.calibration.acquisition.sensor_setup import build_slope_function, prepare_sensor
 from escape_hw.calibration.acquisition.slope_statistics import SlopeStatistics
-from escape_hw.calibration.acquisition.telemetry import TelemetryBuffer
 from escape_hw.calibration.loop.control import build_integrator
 from escape_hw.calibration.loop.runner import RunningLoop
 from escape_hw.calibration.tracking.live_registration import LiveRegistration

@@ -31,7 +31,7 @@ def config() -> SystemConfig:
 
 @pytest.fixture(scope="module")
 def oopao(config):
-    return oopao_model.make_model(config, None)
+    return oopao_model.make_oopao_model(config, None)
 
 
 @pytest.fixture(scope="module")
@@ -94,7 +94,7 @@ def test_matrices_are_equal_on_a_grid_found_elsewhere(config, fast):
         references_px=np.zeros((int(valid.sum()), 2), np.float32),
     )
     ours, theirs = (
-        make(config, grid).zonal_matrix(PAPER) for make in (make_fast_model, oopao_model.make_model)
+        make(config, grid).zonal_matrix(PAPER) for make in (make_fast_model, oopao_model.make_oopao_model)
     )
     assert ours.shape == (2 * int(valid.sum()), 97)
     assert difference(ours, theirs) < TOLERANCE
@@ -118,7 +118,7 @@ def test_the_matrix_is_that_of_oopao_itself(config, oopao):
     light = oopao._light
     lenslets = make_lenslets(light, 24, 14)
     with suppress_output():
-        mirror = oopao._mirror.apply_registration(PAPER, 1.0)
+        mirror = oopao.registered_mirror(PAPER, 1.0)
         own = InteractionMatrix(
             light.source,
             light.telescope,
@@ -154,10 +154,10 @@ def test_a_grid_of_another_size_is_refused(config):
     nominal = nominal_grid(config)
     small = replace(nominal, valid=nominal.valid[:-1, :-1])
     with pytest.raises(CalibrationError, match="n_sub is 24"):
-        oopao_model.make_model(config, small)
+        oopao_model.make_oopao_model(config, small)
 
 
 def test_a_grid_outside_the_pupil_is_refused(config):
     nominal = nominal_grid(config)
     with pytest.raises(CalibrationError, match="outside the design's pupil"):
-        oopao_model.make_model(config, replace(nominal, valid=np.ones_like(nominal.valid)))
+        oopao_model.make_oopao_model(config, replace(nominal, valid=np.ones_like(nominal.valid)))

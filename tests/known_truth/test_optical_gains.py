@@ -183,7 +183,7 @@ def test_turbulence_beyond_the_sensor_is_told(baseline: CalibrationResult) -> No
 def test_numbers_that_mean_nothing_and_strangers_are_refused(
     bench: System, baseline: CalibrationResult
 ) -> None:
-    for wrong in ({"poke": 0.0}, {"accuracy": -1.0}, {"budget": 1.0}, {"gain": 0.0}):
+    for wrong in ({"poke": 0.0}, {"accuracy": -1.0}, {"allowed_strehl_loss": 1.0}, {"gain": 0.0}):
         with pytest.raises(ConfigError, match="must lie between 0 and 1"):
             bench.run(bootstrap_gains(bench, baseline, **wrong))
     valid = baseline.matrix.valid.copy()

@@ -132,7 +132,7 @@ def test_docrime_sees_the_same_modes_through_turbulence_but_weaker(
     assert np.median(found.correlation) > 0.9
     assert 0.15 < np.median(found.gain_ratio) < 0.6
     assert measured.response is not None
-    assert 1.5 < measured.response.delay < 2.6
+    assert 1.5 < measured.response.delay_frames < 2.6
 
 
 def test_loop_closes_with_either_matrix(
@@ -193,7 +193,7 @@ def test_product_of_an_unknown_kind_is_refused(
 ) -> None:
     from escape_hw.io.fits import extensions as fits_geometry
 
-    monkeypatch.setitem(fits_geometry._CONVERTERS, "curvature", fits_geometry._CONVERTERS["pyramid"])
+    monkeypatch.setitem(fits_geometry._CARDS, "curvature", fits_geometry._CARDS["pyramid"])
     monkeypatch.setattr(PyramidPupils, "kind", "curvature")
     path = save_matrix(tmp_path / "im.fits", measured)
     monkeypatch.undo()

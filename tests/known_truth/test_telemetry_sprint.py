@@ -47,7 +47,7 @@ def test_it_finds_the_temporal_response(fifty):
     for _, result in fifty:
         response = result.response
         # Computer, half an exposure, read-out and settling: a little over two frames.
-        assert response.delay == pytest.approx(2.16, abs=0.05)
+        assert response.delay_frames == pytest.approx(2.16, abs=0.05)
         early = np.abs(response.weights[:2]) / response.sigma[:2]
         assert (early < 5).all()
 

@@ -79,7 +79,7 @@ def test_state_devices_geometry_and_frames(bench: Connection, matrix: str) -> No
     first = bench.latest("frames")
     assert first is not None
     assert first.data.shape == (200, 200)
-    assert first.meta["top"] == 1023
+    assert first.meta["full_scale"] == 1023
     wait_for(lambda: bench.latest("frames", first.index) is not None, "another frame")
     geometry = bench.geometry()
     assert sum(row.count("1") for row in geometry.layout) == 37
@@ -112,7 +112,10 @@ def test_the_loop_closes_takes_other_settings_and_opens(bench: Connection, matri
     wait_for(lambda: bench.state.loop.closed and bench.state.loop.residual_nm > 0, "the loop is closed")
     assert bench.state.phase is Phase.LOOP
     assert bench.state.loop.matrix == matrix
-    wait_for(lambda: bench.latest("modes") is not None and bench.latest("modes").data.shape == (30,), "modes")
+    wait_for(lambda: bench.latest("residual_modes") is not None, "residual")
+    assert bench.latest("residual_modes").data.shape == (30,)
+    with pytest.warns(DeprecationWarning, match="residual_modes"):
+        assert bench.latest("modes").data.shape == (30,)
     bench.set_loop(gain=0.25, dropped_modes=6)
     wait_for(lambda: bench.state.loop.gain == 0.25, "the gain")
     assert (bench.state.loop.dropped_modes, bench.state.loop.matrix) == (6, matrix)

@@ -201,7 +201,7 @@ def test_from_afar_the_samples_come_over_the_wire(bench: Connection) -> None:
         sample = far.latest("frames")
         assert sample is not None
         assert sample.data.shape == (200, 200)
-        assert sample.meta["top"] == 1023
+        assert sample.meta["full_scale"] == 1023
         assert far.geometry().n_modes == 30
         with pytest.raises(ConfigError):
             far.plan("nothing")

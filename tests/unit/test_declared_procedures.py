@@ -35,8 +35,7 @@ from escape_hw.runtime.procedures.model_psf import ModelPsfProcedure
 from escape_hw.runtime.procedures.registry import PROCEDURES, find_procedure
 from escape_hw.runtime.procedures.sensor import SensorProcedure
 from escape_hw.runtime.procedures.track import TrackProcedure
-from escape_hw.server.engine.planning import ProcedurePlanner
-from escape_hw.server.engine.procedures import ProcedureRegistry, offered_parameters
+from escape_hw.server.engine.procedures import ProcedurePlanner, ProcedureRegistry, offered_parameters
 from escape_hw.server.engine.product_store import ProductStore
 
 PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "add-a-procedure.md"

@@ -199,9 +199,3 @@ def test_overexposure_stops_at_the_top(bit_depth, read_noise):
     frame, saturated = camera.expose(np.full(SHAPE, 3e9, np.float32), 1.0)
     assert saturated == frame.size
     assert (frame == 2**bit_depth - 1).all()
-
-
-@pytest.mark.parametrize("excess", [0.9, 1.6, float("nan")])
-def test_an_impossible_excess_noise_is_refused(excess):
-    with pytest.raises(ValueError, match="excess_noise"):
-        detector(excess_noise=excess)

@@ -10,13 +10,17 @@ from small_system import configuration
 
 from escape_hw.calibration.loop.divergence import (
     BlockResidualMonitor,
-    DivergenceLimits,
     ResidualMonitor,
     SaturationMonitor,
     is_steady,
 )
+from escape_hw.config.system import ServerSection
 
 RATE_HZ = 500.0
+
+
+def settings(*overrides: str) -> ServerSection:
+    return configuration(*overrides).server
 
 
 def frames_until_opened(monitor: ResidualMonitor, residual: np.ndarray, block: int = 50) -> int | None:
@@ -31,19 +35,10 @@ def converging(frames: int, level: float = 50.0) -> np.ndarray:
     return level + noise + 500 * np.exp(-np.arange(frames) / 10)
 
 
-def test_factor_and_time_come_from_the_configuration():
-    config = configuration(
-        "server.diverging_factor=3", "server.diverging_s=0.4", "server.saturated_fraction=0.5"
-    )
-    limits = DivergenceLimits.from_config(config)
-    assert (limits.residual_factor, limits.residual_s, limits.saturated_fraction) == (3, 0.4, 0.5)
-    assert DivergenceLimits.from_config(configuration()) == DivergenceLimits()
-
-
 @pytest.mark.parametrize("seconds", [0.4, 1.0])
 def test_a_residual_that_stays_too_large_opens_the_loop_after_the_time_configured(seconds):
     residual = np.concatenate([converging(2000), np.full(2000, 700.0)])
-    monitor = ResidualMonitor(DivergenceLimits(residual_s=seconds), RATE_HZ)
+    monitor = ResidualMonitor(settings(f"server.diverging_s={seconds}"), RATE_HZ)
     opened = frames_until_opened(monitor, residual)
     assert opened is not None
     assert 2000 + seconds * RATE_HZ <= opened <= 2000 + seconds * RATE_HZ + 150
@@ -61,17 +56,17 @@ def test_a_residual_that_stays_too_large_opens_the_loop_after_the_time_configure
     ids=["converges", "a gust", "below the factor", "below the residual at closing"],
 )
 def test_these_leave_it_closed(residual):
-    assert frames_until_opened(ResidualMonitor(DivergenceLimits(), RATE_HZ), residual) is None
+    assert frames_until_opened(ResidualMonitor(settings(), RATE_HZ), residual) is None
 
 
 def test_a_residual_that_is_not_finite_opens_it_at_once():
     residual = converging(300)
     residual[120:] = np.nan
-    assert frames_until_opened(ResidualMonitor(DivergenceLimits(), RATE_HZ), residual) == 150
+    assert frames_until_opened(ResidualMonitor(settings(), RATE_HZ), residual) == 150
 
 
 def test_saturation_must_last():
-    is_saturated = SaturationMonitor(DivergenceLimits(), 100)
+    is_saturated = SaturationMonitor(settings(), 100)
     assert not any(is_saturated(21) for _ in range(49))
     assert not is_saturated(20)
     assert not any(is_saturated(100) for _ in range(49))
@@ -79,7 +74,7 @@ def test_saturation_must_last():
 
 
 def test_a_loop_with_pokes_is_compared_with_its_last_blocks():
-    monitor = BlockResidualMonitor(DivergenceLimits())
+    monitor = BlockResidualMonitor(settings())
 
     def block(level: float, shortened: int = 0) -> bool:
         return monitor([level] * 100, shortened)

@@ -16,15 +16,15 @@ from escape_hw.api.procedure import Progress
 from escape_hw.errors import DeviceLost, EscapeError, RequestRefused
 from escape_hw.remote.requests import CloseLoop
 from escape_hw.remote.state import Finish, FinishedRun, Phase
-from escape_hw.server.engine import loop, runner
-from escape_hw.server.engine.loop import LoopRunner
-from escape_hw.server.engine.runner import ProcedureRunner
+from escape_hw.server.engine import runner
+from escape_hw.server.engine.runner import LoopRunner, ProcedureRunner
 from escape_hw.server.engine.state import EngineState, LoopParameters
 from escape_hw.server.engine.state_publisher import StatePublisher
 from escape_hw.server.frontend.engine_process import EngineProcess
 from escape_hw.supervision import Backoff
 
 CLOSED = LoopParameters("im", 0.3, 0.01, 2)
+STORE: Any = SimpleNamespace(matrix_path=Path)
 
 
 def idle_state() -> EngineState:
@@ -46,6 +46,10 @@ class Owner:
         config = SimpleNamespace(system=SimpleNamespace(name="small"), to_toml=str)
         self.bench = SimpleNamespace(wfs=self, config=config, simulated=True)
         self.state = idle_state()
+        self.publisher = SimpleNamespace(reset_residual=lambda: None)
+        self.state_publisher = SimpleNamespace(publish=lambda: None)
+        self.sent: list[Any] = []
+        self.send = self.sent.append
         self.flat = 0
 
     def stop(self) -> None:
@@ -66,23 +70,17 @@ class Owner:
 
 @pytest.fixture
 def owner(monkeypatch: pytest.MonkeyPatch) -> Owner:
-    monkeypatch.setattr(loop, "load_fitting_matrix", lambda *args: SimpleNamespace(result=None))
-    monkeypatch.setattr(loop, "require_hardware_matrix", lambda *args, **options: None)
-    monkeypatch.setattr(loop, "LoopControl", lambda *args, **options: loop_control())
+    monkeypatch.setattr(runner, "load_fitting_matrix", lambda *args: SimpleNamespace(result=None))
+    monkeypatch.setattr(runner, "require_hardware_matrix", lambda *args, **options: None)
+    monkeypatch.setattr(runner, "LoopControl", lambda *args, **options: loop_control())
     owner = Owner()
     monkeypatch.setattr(runner, "load_text", lambda text, overrides: owner.bench.config)
     return owner
 
 
-def services(owner: Owner) -> tuple[Any, ...]:
-    """State, publishers and store, as the runners get them."""
-    publisher = SimpleNamespace(reset_residual=lambda: None)
-    return owner.state, publisher, SimpleNamespace(publish=lambda: None), SimpleNamespace(matrix_path=Path)
-
-
-def procedure_runner(owner: Any, runs: Path, sent: list[Any]) -> ProcedureRunner:
-    loop_runner = LoopRunner(owner, *services(owner))
-    return ProcedureRunner(owner, loop_runner, *services(owner), config_text="", runs=runs, send=sent.append)
+def procedure_runner(owner: Any, runs: Path) -> ProcedureRunner:
+    loop_runner = LoopRunner(owner, STORE)
+    return ProcedureRunner(owner, loop_runner, STORE, config_text="", runs=runs)
 
 
 def finished(run: int) -> FinishedRun:
@@ -92,7 +90,7 @@ def finished(run: int) -> FinishedRun:
 def test_a_loop_that_cannot_be_closed_is_reported_and_does_not_count_as_closed(owner: Any) -> None:
     reported: list[EscapeError | None] = []
     request = CloseLoop(client="0" * 8, matrix="im")
-    LoopRunner(owner, *services(owner)).close(request, reported.append)
+    LoopRunner(owner, STORE).close(request, reported.append)
     now = owner.state.snapshot
     assert [str(error) for error in reported] == ["wfs: the camera has gone"]
     assert now.fault is not None
@@ -101,15 +99,14 @@ def test_a_loop_that_cannot_be_closed_is_reported_and_does_not_count_as_closed(o
 
 def test_a_run_that_cannot_begin_ends(owner: Any, tmp_path: Path) -> None:
     task: Any = SimpleNamespace(kind="docrime", overrides=(), load=lambda config, simulated: None)
-    sent: list[Any] = []
-    assert procedure_runner(owner, tmp_path, sent).start(task, "docrime", {}, needs_loop=False) == 3
+    assert procedure_runner(owner, tmp_path).start(task, "docrime", {}, needs_loop=False) == 3
     now = owner.state.snapshot
     assert now.active_run is None
     assert now.last_run is not None
     assert (now.last_run.finish, now.last_run.message) == (Finish.FAILED, "wfs: the camera has gone")
     assert now.phase is Phase.FAULT
     assert owner.flat == 1
-    assert sent[-1]["ended"]["id"] == 3
+    assert owner.sent[-1]["ended"]["id"] == 3
 
 
 def test_a_closed_loop_is_opened_for_a_procedure_that_needs_one_and_closed_again() -> None:
@@ -210,7 +207,7 @@ def process() -> Any:
     """The front end's side of an engine whose fail-safe process is dead, and a clock."""
     made: Any = EngineProcess.__new__(EngineProcess)
     made.now = 1000.0
-    made._failsafe, made._backoff = SimpleNamespace(pid=4711), Backoff(lambda: made.now)
+    made.failsafe, made._backoff = SimpleNamespace(pid=4711), Backoff(lambda: made.now)
     return made
 
 
@@ -224,7 +221,7 @@ def test_a_fail_safe_process_that_cannot_be_started_does_not_end_the_server(
     process.now += 1
     with caplog.at_level(logging.ERROR):
         process.maintain_failsafe(alive=False)
-    assert process._failsafe.pid == 4711
+    assert process.failsafe.pid == 4711
     assert "next attempt in 2 s: Resource temporarily unavailable" in caplog.text
 
 

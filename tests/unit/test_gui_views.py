@@ -6,12 +6,11 @@ import fake_results as fake
 import numpy as np
 import pytest
 
-from escape_gui.views import mode_mosaic as mosaic
+from escape_gui.views import mode_maps as mosaic
 from escape_gui.views import procedure_form as form
 from escape_gui.views.convergence import ConvergenceHistory, RegistrationDrift
 from escape_gui.views.gain_curves import GainCurve, axis_sides, live_curve
-from escape_gui.views.mode_detail import tiles
-from escape_gui.views.mode_mosaic import ModeStatistics, MosaicLayout
+from escape_gui.views.mode_maps import ModeStatistics, MosaicLayout, tiles
 from escape_hw.api.registration import TO_STREAM_UNITS
 from escape_hw.remote.state import ActiveRun, Finish, FinishedRun, ProcedureParameter, ProductEntry
 

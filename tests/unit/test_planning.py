@@ -12,7 +12,7 @@ from escape_hw.bench import Bench
 from escape_hw.calibration.acquisition.pokes import RandomPokes, compute_poke_amplitudes
 from escape_hw.calibration.modes.bases import build_modal_basis
 from escape_hw.config.loader import load_system
-from escape_hw.server.engine.planning import ProcedurePlanner
+from escape_hw.server.engine.procedures import ProcedurePlanner
 
 
 @pytest.fixture(scope="module")

@@ -72,13 +72,6 @@ def test_dropping_never_takes_more_stroke():
     assert (np.diff(used) < 1e-9).all()
 
 
-def test_regularisation_damps():
-    u, s, v = with_singular_values([4, 2, 1])
-    r = reconstructor((u * s) @ v.T, regularisation=0.25)
-    # sigma / (sigma^2 + (0.25 * 4)^2)
-    assert r == pytest.approx((v * (s / (s**2 + 1))) @ u.T, abs=1e-6)
-
-
 @pytest.mark.parametrize("dropped", [-1, 12, 20])
 def test_dropping_all_is_an_error(dropped):
     with pytest.raises(CalibrationError, match="drop fewer"):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import fake_results as fake
 import pytest
 
@@ -18,3 +20,18 @@ def test_optical_gains():
     result = fake.gains_result()
     with pytest.warns(DeprecationWarning, match=r"GainsResult.beside is called"):
         assert result.beside is result.comparisons
+
+
+def test_a_metric_of_a_matrix():
+    matrix = replace(fake.calibration().matrix, metrics={"shortened": 3})
+    assert matrix.metrics == {"clipped_pokes": 3}
+    with pytest.warns(DeprecationWarning, match="the metric 'shortened' is called 'clipped_pokes'"):
+        assert matrix.metrics["shortened"] == 3
+    with pytest.raises(KeyError):
+        matrix.metrics["unknown"]
+
+
+def test_the_delay():
+    response = fake.calibration().response
+    with pytest.warns(DeprecationWarning, match=r"TemporalResponse.delay is called"):
+        assert response.delay == response.delay_frames

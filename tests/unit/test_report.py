@@ -303,7 +303,7 @@ def test_the_temporal_response_is_drawn_in_percent():
     response = fake.calibration("docrime").response
     axes = figures_bench.temporal_response(response).axes[0]
     assert [bar.get_height() for bar in axes.patches] == pytest.approx(list(100 * response.weights))
-    assert f"{response.delay:.2f} frames" in axes.get_title()
+    assert f"{response.delay_frames:.2f} frames" in axes.get_title()
 
 
 def test_psfs_are_drawn_without_their_background():
@@ -337,4 +337,4 @@ def test_picture_of_a_run(tmp_path):
 
 def test_sky_time_is_told_in_words_too(page):
     assert "rms over 20 random registrations" in page
-    assert "Fewest frames that meet every goal: whitened 500, plain none of these." in page
+    assert "Fewest frames that meet every goal: whitened 500, unwhitened none of these." in page

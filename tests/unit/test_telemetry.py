@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from escape_hw.calibration.acquisition.telemetry import AlignedBuffer, AlignedTelemetry
+from escape_hw.calibration.acquisition.aligned_telemetry import AlignedBuffer, AlignedTelemetry
 
 
 def recorder(index, rows=100, n_slopes=3, n_modes=2):

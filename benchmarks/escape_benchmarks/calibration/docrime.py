@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from escape_benchmarks.peers.pyrtcao import NOT_INSTALLED, import_pyrtc, peer_name
+from escape_benchmarks.rows import time_row
 from escape_hw.api.benchmark import BenchmarkRow, time_alternately
 from escape_hw.api.procedure import run as drive
 from escape_hw.bench import Bench
@@ -85,38 +86,23 @@ def run() -> list[BenchmarkRow]:
         with pyrtc_docrime(data) as peer:
             error = None if peer is None else data.error(peer())
             note = NOT_INSTALLED if absent else size + (", turbulence 17 times the pokes" if spectrum else "")
+            ours = data.error(estimate_recorded(data))
             rows.append(
-                BenchmarkRow(
-                    f"docrime: IM error, {label}",
-                    data.error(estimate_recorded(data)),
-                    error,
-                    peer_label,
-                    "1",
-                    "lower",
-                    note,
-                )
+                BenchmarkRow(f"docrime: IM error, {label}", ours, error, peer_label, "1", "lower", note)
             )
             if spectrum is not first_order_turbulence:
                 continue
-            for how, ours in (
+            note = NOT_INSTALLED if absent else f"{size}, solution included"
+            for how, estimate in (
                 ("recorded", estimate_recorded),
                 ("as they come", estimate_streaming),
                 # More than the peer finds: for SPRINT, which wants the noise's covariance between slopes.
                 ("recorded, with the noise's covariance", partial(estimate_recorded, correlations=True)),
                 ("as they come, with the noise's covariance", partial(estimate_streaming, correlations=True)),
             ):
-                ours_s, peer_s = time_alternately(partial(ours, data), peer, rounds=5)
-                rows.append(
-                    BenchmarkRow(
-                        f"docrime: time per frame, {how}",
-                        ours_s * 1e6 / _N_FRAMES,
-                        None if peer_s is None else peer_s * 1e6 / _N_FRAMES,
-                        peer_label,
-                        "us",
-                        "lower",
-                        NOT_INSTALLED if absent else f"{size}, solution included",
-                    )
-                )
+                ours_s, peer_s = time_alternately(partial(estimate, data), peer, rounds=5)
+                times = ours_s / _N_FRAMES, None if peer_s is None else peer_s / _N_FRAMES
+                rows.append(time_row(f"docrime: time per frame, {how}", times, peer_label, "us", note))
     return [*rows, frames_row()]
 
 

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from escape_benchmarks.peers.oopao import MirrorUnderTest, OopaoPeer, SolverResult
 from escape_benchmarks.peers.specula import MISSING, specula_peer
+from escape_benchmarks.rows import time_row
 from escape_hw.api.benchmark import BenchmarkRow, product_rate, time_alternately
 from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.registration import PARAMETERS, Registration
@@ -52,8 +53,10 @@ PITCHES, DIRECTIONS = (0.25, 0.5, 1.0, 1.5, 2.0), (20.0, 200.0)
 OTHER_PARAMETERS = (1.0, 2.0, 0.0)
 #: What counts as found from afar, in the units of the parameters; there is no noise in these.
 CAPTURE_TOLERANCE = np.array([5.0, 5.0, 0.1, 0.5, 0.5])
-#: Gain and registration only, and with what the model does not know.
-_SOLVERS: tuple[Solver, ...] = ("registration-only", "mixed-effects")
+#: Labels and solvers: gain and registration only, and with what the model does not know.
+_REGISTRATION_ONLY: tuple[str, Solver] = ("registration only", "registration-only")
+_WITH_MISFIT: tuple[str, Solver] = ("with misfit", "mixed-effects")
+_SOLVERS = (_REGISTRATION_ONLY, _WITH_MISFIT)
 _OOPAO_SENSOR = ("sensor.pitch_px=16", "sensor.spot_px=2")
 #: OOPAO's pupil images stand on a square around the middle of its grid.
 _OOPAO_PYRAMID = (
@@ -79,7 +82,7 @@ def run() -> list[BenchmarkRow]:
         oopao = OopaoPeer(oopao_like, modes)
         rows += _matrices(oopao_like, oopao, what)
         rows += _times(oopao_like, oopao, what, NOISE)
-        rows += _exact(oopao_like, oopao, what, (("no noise, light", "registration-only"),))
+        rows += _exact(oopao_like, oopao, what, (_REGISTRATION_ONLY,))
         rows += _accuracy(oopao_like, bench, oopao, what)
         rows += _capture_rows(oopao_like, oopao, what)
         rows += _specula_rows(bench, modes)
@@ -95,12 +98,7 @@ def pyramid_rows() -> list[BenchmarkRow]:
         oopao = OopaoPeer(oopao_like, modes)
         rows += _matrices(oopao_like, oopao, what)
         rows += _times(oopao_like, oopao, what, 0.0)
-        rows += _exact(
-            oopao_like,
-            oopao,
-            what,
-            (("no noise, light", "registration-only"), ("no noise, with misfit", "mixed-effects")),
-        )
+        rows += _exact(oopao_like, oopao, what, (_REGISTRATION_ONLY, _WITH_MISFIT))
         rows += _capture_rows(oopao_like, oopao, what)
     return rows
 
@@ -136,14 +134,9 @@ class EscapeSolver:
 
         def solve(data: NDArray[np.float64]) -> SolverResult:
             sigma = np.full(data.shape, _sigma(data) if noise else 0.0, np.float32)
+            system = self.config.system.name
             matrix = InteractionMatrix(
-                data.astype(np.float32),
-                sigma,
-                self.m2c,
-                grid.valid,
-                self.config.system.name,
-                "push-pull",
-                True,
+                data.astype(np.float32), sigma, self.m2c, grid.valid, system, "push-pull", True
             )
             found = sprint(matrix, model, solver=solver_name)
             return SolverResult(found.registration, found.converged)
@@ -177,20 +170,11 @@ def _matrices(config: SystemConfig, oopao: OopaoPeer, what: str) -> list[Benchma
     alone, whole = (1e3 * count / rate for count in _operations(config, model.n_act, m2c.shape[1]))
     with_derivatives = time_alternately(lambda: modal_jacobian(model, at, m2c), None, rounds=3)[0]
     matrices = 1 + 2 * len(PARAMETERS)
-    rows = (
-        ("synthetic matrix", times[0], times[1], alone, note),
-        (
-            "with derivatives",
-            with_derivatives,
-            _scaled(times[1], matrices),
-            whole,
-            f"{matrices} of OOPAO's",
-        ),
-    )
-    peer_label = f"{oopao.name.split(':')[0]}: mirror and InteractionMatrix"
+    repeated = None if times[1] is None else matrices * times[1]
+    peer, many = f"{oopao.name.split(':')[0]}: mirror and InteractionMatrix", f"{matrices} of OOPAO's"
     return [
-        BenchmarkRow(f"{what}: {label}", 1e3 * a, _scaled(b, 1e3), peer_label, "ms", "lower", text, floor)
-        for label, a, b, floor, text in rows
+        time_row(f"{what}: synthetic matrix", times, peer, "ms", note, alone),
+        time_row(f"{what}: with derivatives", (with_derivatives, repeated), peer, "ms", many, whole),
     ]
 
 
@@ -215,10 +199,6 @@ def _pyramid_operations(config: SystemConfig, n_act: int, n_modes: int) -> tuple
     return one, (1 + N_DERIVATIVES) * one
 
 
-def _scaled(seconds: float | None, factor: float) -> float | None:
-    return None if seconds is None else factor * seconds
-
-
 def _times(config: SystemConfig, oopao: OopaoPeer, what: str, noise: float) -> list[BenchmarkRow]:
     ours, noisy = EscapeSolver(config, oopao.m2c), noise > 0
     data = oopao.matrix(injected(config), mirror(False))
@@ -227,37 +207,31 @@ def _times(config: SystemConfig, oopao: OopaoPeer, what: str, noise: float) -> l
     peer_label, note = f"{oopao.name}, 6 iterations", f"OOPAO's matrix, {noise:.0%} noise"
     set_up = time_alternately(lambda: make_fast_model(config, None), oopao.set_up, rounds=2)
     wide_up = time_alternately(lambda: list(make_fast_model(config, None).variants()), None, rounds=2)[0]
-    light, full = (ours.solver(solver_name, noise=noisy) for solver_name in _SOLVERS)
-    solve = time_alternately(lambda: light(data), lambda: oopao.solve(data), rounds=3)
+    registration_only, full = (ours.solver(name, noise=noisy) for _, name in _SOLVERS)
+    solve = time_alternately(lambda: registration_only(data), lambda: oopao.solve(data), rounds=3)
     wide = time_alternately(lambda: full(data), None, rounds=3)[0]
-    theirs = _sum(set_up[1], solve[1])
+    theirs = None if set_up[1] is None or solve[1] is None else set_up[1] + solve[1]
     timed = (
-        ("set-up", *set_up, "mirror, sensor and telescope exist already"),
-        ("one solution, light", *solve, note),
-        ("one solution, with misfit", wide, solve[1], note),
-        ("set-up and solution, light", set_up[0] + solve[0], theirs, note),
-        ("set-up and solution, with misfit", wide_up + wide, theirs, note),
+        ("set-up", set_up, "mirror, sensor and telescope exist already"),
+        ("one solution, registration only", solve, note),
+        ("one solution, with misfit", (wide, solve[1]), note),
+        ("set-up and solution, registration only", (set_up[0] + solve[0], theirs), note),
+        ("set-up and solution, with misfit", (wide_up + wide, theirs), note),
     )
-    return [
-        BenchmarkRow(f"{what}: {label}", a, b, peer_label, "s", "lower", text) for label, a, b, text in timed
-    ]
-
-
-def _sum(a: float | None, b: float | None) -> float | None:
-    return None if a is None or b is None else a + b
+    return [time_row(f"{what}: {label}", times, peer_label, "s", text) for label, times, text in timed]
 
 
 def _exact(
     config: SystemConfig, oopao: OopaoPeer, what: str, cases: Sequence[tuple[str, Solver]]
 ) -> list[BenchmarkRow]:
-    """Errors on a matrix of OOPAO's without noise, for solvers with a label and with misfit or not."""
+    """Errors on a matrix of OOPAO's without noise, for solvers with their labels."""
     oopao.set_up()
     at, ours = injected(config), EscapeSolver(config, oopao.m2c)
     matrix = [oopao.matrix(at, mirror(False))]
     theirs, rows = _errors(oopao.solve, matrix, at), []
     for label, solver_name in cases:
         our_data = _errors(ours.solver(solver_name, noise=False), matrix, at)
-        rows += _error_rows(what, label, our_data, theirs, f"{oopao.name}, 6 iterations")
+        rows += _error_rows(what, f"no noise, {label}", our_data, theirs, f"{oopao.name}, 6 iterations")
     return rows
 
 
@@ -265,13 +239,13 @@ def _accuracy(
     oopao_like: SystemConfig, bench: SystemConfig, oopao: OopaoPeer, what: str
 ) -> list[BenchmarkRow]:
     """Errors on OOPAO's noisy matrices, and each on its own."""
-    light, full = (EscapeSolver(oopao_like, oopao.m2c).solver(solver_name) for solver_name in _SOLVERS)
+    solvers = {label: EscapeSolver(oopao_like, oopao.m2c).solver(name) for label, name in _SOLVERS}
     own = EscapeSolver(bench, oopao.m2c)
     peer_label, rows = f"{oopao.name}, 6 iterations", []
     for kind in ("ideal", "real"):
         matrices = _draws(oopao.matrix(INJECTED, mirror(kind == "real")))
         theirs = _errors(oopao.solve, matrices, INJECTED)
-        for label, solve in (("light", light), ("with misfit", full)):
+        for label, solve in solvers.items():
             our_data = _errors(solve, matrices, INJECTED)
             rows += _error_rows(what, f"{kind} mirror, {label}", our_data, theirs, peer_label)
         if kind == "ideal":
@@ -282,7 +256,7 @@ def _accuracy(
 
 def _capture_rows(config: SystemConfig, oopao: OopaoPeer, what: str) -> list[BenchmarkRow]:
     """How many far registrations are found, and how many wrong ones are vouched for."""
-    light = EscapeSolver(config, oopao.m2c).solver("registration-only", noise=False)
+    solve = EscapeSolver(config, oopao.m2c).solver("registration-only", noise=False)
     pitch = 100 * config.sensor.n_sub / config.devices.dm.pitches_across_pupil
     # The same share of the pupil on every sensor.
     tolerance = CAPTURE_TOLERANCE * ([config.sensor.n_sub / INJECTED_N_SUB] * 2 + [1] * 3)
@@ -296,7 +270,7 @@ def _capture_rows(config: SystemConfig, oopao: OopaoPeer, what: str) -> list[Ben
     found, wrong = np.zeros(2, int), np.zeros(2, int)
     for registration in places:
         data = oopao.matrix(registration, mirror(False))
-        for k, answer in enumerate((light(data), oopao.solve(data, 10))):
+        for k, answer in enumerate((solve(data), oopao.solve(data, 10))):
             error = np.abs(answer.registration.to_array() - registration.to_array())
             right = bool((error < tolerance).all())
             found[k] += right and answer.valid
@@ -304,32 +278,28 @@ def _capture_rows(config: SystemConfig, oopao: OopaoPeer, what: str) -> list[Ben
     peer_label = f"{oopao.name}, 10 iterations"
     note = f"shifts of {PITCHES[0]} to {PITCHES[-1]} actuator pitches, turned and scaled; no noise"
     unit = f"of {len(places)}"
+    ours, theirs = zip(found.tolist(), wrong.tolist(), strict=True)
     return [
-        BenchmarkRow(
-            f"{what}: found from afar", int(found[0]), int(found[1]), peer_label, unit, "higher", note
-        ),
-        BenchmarkRow(
-            f"{what}: wrong but vouched for", int(wrong[0]), int(wrong[1]), peer_label, unit, "lower", note
-        ),
+        BenchmarkRow(f"{what}: found from afar", ours[0], theirs[0], peer_label, unit, "higher", note),
+        BenchmarkRow(f"{what}: wrong but vouched for", ours[1], theirs[1], peer_label, unit, "lower", note),
     ]
 
 
 def _specula_rows(config: SystemConfig, modes: NDArray[np.float64]) -> list[BenchmarkRow]:
     ours = EscapeSolver(config, modes)
-    light, what = ours.solver("registration-only"), f"sprint, {modes.shape[1]} modes"
+    solve, what = ours.solver("registration-only"), f"sprint, {modes.shape[1]} modes"
     our_data = _draws(ours.matrix(INJECTED_EQUAL_SCALINGS))
     peer = specula_peer(config, modes, make_fast_model(config, None))
-    label, note = "each its own sensor, light", "one scaling injected; SPECULA knows no more"
+    label, note = "each its own sensor, registration only", "one scaling injected; SPECULA knows no more"
     if peer is None:
-        seconds = time_alternately(lambda: light(our_data[0]), None, rounds=2)[0]
-        return [BenchmarkRow(f"{what}: {label}", seconds, None, "SPECULA", "s", "lower", MISSING)]
+        seconds = time_alternately(lambda: solve(our_data[0]), None, rounds=2)[0]
+        return [time_row(f"{what}: {label}", (seconds, None), "SPECULA", "s", MISSING)]
     theirs = _draws(peer.matrix(INJECTED_EQUAL_SCALINGS))
-    times = time_alternately(lambda: light(our_data[0]), lambda: peer.solve(theirs[0]), rounds=2)
+    times = time_alternately(lambda: solve(our_data[0]), lambda: peer.solve(theirs[0]), rounds=2)
     peer_label = f"{peer.name}, 6 iterations"
-    rows = [BenchmarkRow(f"{what}: {label}", *times, peer_label, "s", "lower", note)]
+    rows = [time_row(f"{what}: {label}", times, peer_label, "s", note)]
     errors = [
-        _errors(solve, data, INJECTED_EQUAL_SCALINGS)
-        for solve, data in ((light, our_data), (peer.solve, theirs))
+        _errors(one, data, INJECTED_EQUAL_SCALINGS) for one, data in ((solve, our_data), (peer.solve, theirs))
     ]
     for e in errors:
         # Two scalings against one: their mean is what compares.

@@ -13,6 +13,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from escape_benchmarks.rows import time_row
 from escape_drivers.asm import messages as m
 from escape_drivers.asm.codec import HEADER_BYTES, AsmCodec
 from escape_drivers.asm.mirror import AsmMirror
@@ -33,22 +34,17 @@ def run() -> list[BenchmarkRow]:
     section = load_system("maps-nir").devices.dm
     with _emulator() as ours, _emulator() as theirs:
         mirror = AsmMirror("dm", section, AsmOptions(port=ours, heartbeat_s=60.0))
-        with mirror, _BareSocketClient(theirs, section.n_act) as bare_client:
+        with mirror, contextlib.closing(_BareSocketClient(theirs, section.n_act)) as bare_client:
             legal = np.full(section.n_act, 0.001)
             legal[list(section.limits.disabled)] = 0.0
             shapes = [legal, -legal]
             turn = iter(range(1 << 62))
-            mine, peer = time_alternately(
+            times = time_alternately(
                 lambda: mirror.send(shapes[next(turn) % 2]), bare_client.command, seconds=0.3
             )
-    return [
-        BenchmarkRow(
-            "asm: command and acknowledgement", mine * 1e6, None if peer is None else peer * 1e6,
-            "bare socket to the same emulator, frames made beforehand", "us", "lower",
-            note="336 actuators over loopback, emulator in a process of its own",
-        ),
-        _codec_row(section),
-    ]  # fmt: skip
+    peer = "bare socket to the same emulator, frames made beforehand"
+    note = "336 actuators over loopback, emulator in a process of its own"
+    return [time_row("asm: command and acknowledgement", times, peer, "us", note), _codec_row(section)]
 
 
 def _codec_row(section: MirrorConfig) -> BenchmarkRow:
@@ -64,11 +60,8 @@ def _codec_row(section: MirrorConfig) -> BenchmarkRow:
         zlib.crc32(metres.astype("<f4").tobytes())
         zlib.crc32(payload[:24])
 
-    mine, peer = time_alternately(ours, lower_bound, seconds=0.2)
-    return BenchmarkRow(
-        "asm: frame of a command", mine * 1e6, None if peer is None else peer * 1e6,
-        "numpy conversion and zlib's checksums alone", "us", "lower",
-    )  # fmt: skip
+    times = time_alternately(ours, lower_bound, seconds=0.2)
+    return time_row("asm: frame of a command", times, "numpy conversion and zlib's checksums alone", "us")
 
 
 @contextlib.contextmanager
@@ -107,11 +100,7 @@ class _BareSocketClient:
         made = (bytes(self._codec.command(start + k, now, k, metres)) for k in range(1, _READY + 1))
         self._frames = iter(list(made))
 
-    def __enter__(self) -> _BareSocketClient:
-        """Connected already."""
-        return self
-
-    def __exit__(self, *error: object) -> None:
+    def close(self) -> None:
         """Disconnect."""
         self._socket.close()
 

@@ -10,6 +10,7 @@ from contextlib import ExitStack
 from functools import partial
 from typing import Any
 
+from escape_benchmarks.rows import time_row
 from escape_drivers.pi.controller import E727
 from escape_drivers.pi.link import GcsLink
 from escape_drivers.pi.transports import TcpTransport
@@ -72,17 +73,9 @@ def _client(host: str, port: int) -> Any:
 
 
 def _row(what: str, ours: Callable[[], object], peer: Callable[[], object] | None, name: str) -> BenchmarkRow:
-    ours_s, peer_s = time_alternately(ours, peer, seconds=0.5)
     note = _ABSENT if peer is None else "over loopback to the emulator, which takes most of the time"
-    return BenchmarkRow(
-        f"drivers: E-727 {what}",
-        ours_s * 1e6,
-        None if peer_s is None else peer_s * 1e6,
-        name,
-        "us",
-        "lower",
-        note,
-    )
+    times = time_alternately(ours, peer, seconds=0.5)
+    return time_row(f"drivers: E-727 {what}", times, name, "us", note)
 
 
 def _pipython_name() -> str:

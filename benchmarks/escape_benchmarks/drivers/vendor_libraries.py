@@ -12,12 +12,12 @@ from typing import Any
 
 import numpy as np
 
+from escape_benchmarks.rows import time_row
 from escape_hw.api.benchmark import BenchmarkRow, time_alternately
 from escape_hw.config.loader import load_system
 from escape_hw.config.registry import device_factory
 from escape_sim.stand_ins import StandIn, StandInUnavailable
 
-_US = 1e6
 _IMAGE_BYTES = 288
 _BP_AT = 8
 
@@ -46,18 +46,18 @@ def _mirror(asdk: StandIn) -> list[BenchmarkRow]:
         time_c = asdk.library.escape_stand_in_time
         time_c.argtypes, time_c.restype = [ctypes.c_void_p, ctypes.c_void_p, ctypes.c_long], ctypes.c_double
         in_c = time_c(handle, pointer, 100_000) * 1e-3
-        note = f"in C {in_c:.2f} us"
         # The driver's own part, behind the guard, is what is measured.
         transfer = dm._send  # noqa: SLF001
-        rows = []
-        for what, call in (
-            ("transfer", lambda: transfer(values)),
-            ("send, with the guard", lambda: dm.send(values)),
-        ):
-            ours, peer = time_alternately(call, lambda: send(handle, pointer), seconds=0.3)
-            assert peer is not None
-            rows.append(_row(f"drivers: ALPAO {what}", ours, peer, "asdkSend by ctypes", note))
-        return rows
+        calls = {"transfer": lambda: transfer(values), "send, with the guard": lambda: dm.send(values)}
+        return [
+            _row(
+                f"drivers: ALPAO {what}",
+                time_alternately(call, lambda: send(handle, pointer), seconds=0.3),
+                "asdkSend by ctypes",
+                f"in C {in_c:.2f} us",
+            )
+            for what, call in calls.items()
+        ]
 
 
 def _camera(m3api: StandIn) -> list[BenchmarkRow]:
@@ -86,15 +86,15 @@ def _frame(m3api: StandIn, camera: Any, what: str) -> BenchmarkRow:
         np.frombuffer(kind.from_address(pixels.value or 0), np.uint16).copy()
 
     # Both read the same camera; to either, the other's frames are lost ones.
-    ours, peer = time_alternately(lambda: camera.next_frame(1.0), directly, seconds=0.4)
-    assert peer is not None
+    times = time_alternately(lambda: camera.next_frame(1.0), directly, seconds=0.4)
     time_c = m3api.library.escape_stand_in_time
     time_c.argtypes, time_c.restype = [ctypes.c_void_p, ctypes.c_void_p, ctypes.c_long], ctypes.c_double
     note = f"in C, without the copy, {time_c(handle, address, 20_000) * 1e-3:.2f} us"
     stage = f"drivers: XIMEA frame {shape[1]} x {shape[0]}, {what}"
-    return _row(stage, ours, peer, "xiGetImage by ctypes, copied", note)
+    return _row(stage, times, "xiGetImage by ctypes, copied", note)
 
 
-def _row(stage: str, ours_s: float, peer_s: float, peer: str, note: str) -> BenchmarkRow:
-    over = f"{(ours_s - peer_s) * _US:+.2f} us; {note}"
-    return BenchmarkRow(stage, ours_s * _US, peer_s * _US, peer, "us", "lower", over)
+def _row(stage: str, times: tuple[float, float | None], peer: str, note: str) -> BenchmarkRow:
+    ours_s, peer_s = times
+    assert peer_s is not None
+    return time_row(stage, times, peer, "us", f"{(ours_s - peer_s) * 1e6:+.2f} us; {note}")

@@ -12,6 +12,7 @@ import pyfftw
 from numpy.typing import NDArray
 
 from escape_benchmarks.optics.frames import oopao_frame, twin_frame
+from escape_benchmarks.rows import frame_rate_row, time_row
 from escape_hw.api.benchmark import BenchmarkRow, time_alternately
 from escape_hw.api.registration import Registration
 from escape_hw.config.loader import load_system
@@ -49,13 +50,7 @@ def _square(name: str, n_px: int, samples: int, grid: int) -> _Case:
 
 
 def pyramid_rows(peer: str) -> list[BenchmarkRow]:
-    """Rows of the stage ``optics`` about pyramids.
-
-    Parameters
-    ----------
-    peer
-        Name and version of OOPAO.
-    """
+    """Rows of the stage ``optics`` about pyramids, for that name and version of OOPAO."""
     config = load_system(_SYSTEM, overrides=["twin.substeps=1", "twin.loss_probability=0"])
     found = np.add(config.sensor_as(PyramidSection).pupils_px, config.twin.pyramid.centre_offsets_px)
     cases = (
@@ -74,8 +69,8 @@ def pyramid_rows(peer: str) -> list[BenchmarkRow]:
 
 def _frames(stage: str, config: SystemConfig, peer: str, note: str) -> BenchmarkRow:
     """Whole frames, from the command to the quantised image."""
-    ours_s, peer_s = time_alternately(twin_frame(config), oopao_frame(config), seconds=3.0)
-    return _rate(stage, ours_s, peer_s, f"{peer}: atmosphere, mirror, sensor, noise", note)
+    times = time_alternately(twin_frame(config), oopao_frame(config), seconds=3.0)
+    return frame_rate_row(stage, times, f"{peer}: atmosphere, mirror, sensor, noise", note)
 
 
 def _matrix(config: SystemConfig, peer: str) -> BenchmarkRow:
@@ -83,22 +78,16 @@ def _matrix(config: SystemConfig, peer: str) -> BenchmarkRow:
     start = time.perf_counter()
     ours = make_fast_model(config, None)
     built_s = time.perf_counter() - start
-    theirs = oopao_model.make_model(config, None)
+    theirs = oopao_model.make_oopao_model(config, None)
     at = Registration(62.0, -138.0, 0.9, -1.7, 0.8)
     a, b = ours.zonal_matrix(at), theirs.zonal_matrix(at)
     agreement = float(np.linalg.norm(a - b) / np.linalg.norm(b))
-    ours_s, peer_s = time_alternately(
+    times = time_alternately(
         lambda: ours.zonal_matrix(at), lambda: theirs.zonal_matrix(at), seconds=1.0, rounds=1
     )
-    return BenchmarkRow(
-        "optics: pyramid zonal matrix",
-        ours_s * 1e3,
-        peer_s * 1e3 if peer_s else None,
-        f"{peer}: mirror and sensor, push and pull",
-        "ms",
-        "lower",
-        f"relative difference {agreement:.1e}; ours built in {built_s:.2f} s, for all registrations",
-    )
+    note = f"relative difference {agreement:.1e}; ours built in {built_s:.2f} s, for all registrations"
+    name = f"{peer}: mirror and sensor, push and pull"
+    return time_row("optics: pyramid zonal matrix", times, name, "ms", note)
 
 
 def _kernel(case: _Case, peer: str) -> BenchmarkRow:
@@ -122,22 +111,18 @@ def _kernel(case: _Case, peer: str) -> BenchmarkRow:
         with suppress_output():
             slow.light.source**slow.light.telescope * given * slow.sensor
 
-    ours_s, peer_s = time_alternately(lambda: fast.frame(path), theirs, seconds=2.0, rounds=5)
+    times = time_alternately(lambda: fast.frame(path), theirs, seconds=2.0, rounds=5)
     floor_s, what = _arithmetic_floor(n, case.grid * case.samples, fast)
     note = (
-        f"{n} samples on {case.grid * case.samples}, {fast.modulation.n_points} points; "
-        f"relative difference {agreement:.0e}; {what} alone take {floor_s / ours_s:.0%} of the time"
+        f"{n} samples on {case.grid * case.samples}, {len(fast.modulation.points)} points; "
+        f"relative difference {agreement:.0e}; {what} alone take {floor_s / times[0]:.0%} of the time"
     )
-    return _rate(f"optics: pyramid, {case.name}", ours_s, peer_s, f"{peer} Pyramid", note)
-
-
-def _rate(stage: str, ours_s: float, peer_s: float | None, peer: str, note: str) -> BenchmarkRow:
-    return BenchmarkRow(stage, 1 / ours_s, 1 / peer_s if peer_s else None, peer, "frame/s", "higher", note)
+    return frame_rate_row(f"optics: pyramid, {case.name}", times, f"{peer} Pyramid", note)
 
 
 def _arithmetic_floor(n: int, size: int, optics: PyramidOptics) -> tuple[float, str]:
     """Seconds that nothing but the arithmetic of a frame takes, and what that is."""
-    if optics.method == "separable":
+    if optics.uses_matrix_products:
         h = n // 2
         once_s = 0.0
         for left, right in (((2, n, h), (2, h, size // 2)), ((2, size // 2, h), (2, h, size))):
@@ -149,4 +134,4 @@ def _arithmetic_floor(n: int, size: int, optics: PyramidOptics) -> tuple[float, 
         plan = pyfftw.FFTW(source, out, axes=(1,), flags=("FFTW_ESTIMATE",))
         once_s = time_alternately(plan.execute, None, seconds=0.3)[0] * (n + 3 * size) / size
         what = "transforms"
-    return once_s * optics.modulation.n_points / WORKERS, what
+    return once_s * len(optics.modulation.points) / WORKERS, what

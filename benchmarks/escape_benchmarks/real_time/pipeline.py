@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from escape_benchmarks.peers.pyrtcao import NOT_INSTALLED, import_pyrtc, peer_name
+from escape_benchmarks.rows import time_row
 from escape_hw.api.benchmark import BenchmarkRow, time_alternately
 from escape_hw.api.pyramid import PyramidPupils, pupil_boxes
 from escape_hw.api.sensor import SubApertureGrid
@@ -48,16 +49,9 @@ def _slopes(n_sub: int, pitch: int) -> BenchmarkRow:
         worst = float(np.abs(extractor(frame) - peer().ravel()).max())
         note = f"largest difference {worst:.1e} px" if worst < 1e-4 else f"DISAGREES by {worst:.1e} px"
     out = np.empty(grid.n_slopes, np.float32)
-    ours_s, peer_s = time_alternately(lambda: extractor(frame, None, out), peer)
-    return BenchmarkRow(
-        f"pipeline: slopes {n_sub} x {n_sub}, {pitch} px",
-        ours_s * 1e6,
-        None if peer_s is None else peer_s * 1e6,
-        peer_name("compute_slopes_shwfs_optim_numba"),
-        "us",
-        "lower",
-        note,
-    )
+    times = time_alternately(lambda: extractor(frame, None, out), peer)
+    stage = f"pipeline: slopes {n_sub} x {n_sub}, {pitch} px"
+    return time_row(stage, times, peer_name("compute_slopes_shwfs_optim_numba"), "us", note)
 
 
 def _pyramid(n: int, normalisation: str) -> BenchmarkRow:
@@ -75,18 +69,8 @@ def _pyramid(n: int, normalisation: str) -> BenchmarkRow:
     worst = float(np.abs(slopes_of(frame) - slopes_of_image(frame, pupils)).max())
     note = f"largest difference {worst:.1e}" if worst < 1e-5 else f"DISAGREES by {worst:.1e}"
     out = np.empty(pupils.n_slopes, np.float32)
-    ours_s, peer_s = time_alternately(
-        lambda: slopes_of(frame, None, out), lambda: slopes_of_image(frame, pupils)
-    )
-    return BenchmarkRow(
-        f"pipeline: pyramid slopes {n} px, {normalisation}",
-        ours_s * 1e6,
-        None if peer_s is None else peer_s * 1e6,
-        "numpy",
-        "us",
-        "lower",
-        note,
-    )
+    times = time_alternately(lambda: slopes_of(frame, None, out), lambda: slopes_of_image(frame, pupils))
+    return time_row(f"pipeline: pyramid slopes {n} px, {normalisation}", times, "numpy", "us", note)
 
 
 def _peer_slopes(
@@ -123,16 +107,9 @@ def _integrator(n_modes: int, n_slopes: int) -> BenchmarkRow:
         worst = float(np.abs(ours(slopes) - peer()).max() / np.abs(start).max())
         # Large reconstructors are held in 16 bits.
         note = f"largest difference {worst:.1e}" if worst < 1e-4 else f"DISAGREES by {worst:.1e}"
-    ours_s, peer_s = time_alternately(lambda: ours(slopes), peer)
-    return BenchmarkRow(
-        f"pipeline: integrator {n_modes} x {n_slopes}",
-        ours_s * 1e6,
-        None if peer_s is None else peer_s * 1e6,
-        peer_name("leaky_integrator_numba"),
-        "us",
-        "lower",
-        note,
-    )
+    times = time_alternately(lambda: ours(slopes), peer)
+    stage = f"pipeline: integrator {n_modes} x {n_slopes}"
+    return time_row(stage, times, peer_name("leaky_integrator_numba"), "us", note)
 
 
 def _peer_integrator(

@@ -55,8 +55,6 @@ class Checkpoint:
 
         Parameters
         ----------
-        bench
-            An open bench.
         method
             Name of the method.
         m2c

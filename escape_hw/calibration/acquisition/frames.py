@@ -18,12 +18,12 @@ DARK_FRAMES = 25
 DARK_FRACTION = 0.02
 
 
-def validate_frame_count(frames: int, name: str = "frames") -> int:
+def validate_frame_count(frames: int) -> int:
     """Return a number of frames; raise :class:`ConfigError` unless it is an integer of at least one."""
     if isinstance(frames, bool) or not isinstance(frames, int | np.integer):
-        raise ConfigError(f"{name} is {frames!r}; it must be a whole number")
+        raise ConfigError(f"frames is {frames!r}; it must be a whole number")
     if frames < 1:
-        raise ConfigError(f"{name} is {frames}; it must be at least 1")
+        raise ConfigError(f"frames is {frames}; it must be at least 1")
     return frames
 
 
@@ -32,12 +32,7 @@ class FluxMonitor:
 
     Without light slopes are noise or exactly zero, which would pass for a perfect wavefront.
 
-    Parameters
-    ----------
-    camera_name
-        Name of the camera, for the message.
-    grid
-        Geometry with the usual flux of each sub-aperture.
+    ``grid``: geometry with the usual flux of each sub-aperture.
     """
 
     def __init__(self, camera_name: str, grid: SensorGeometry) -> None:
@@ -69,12 +64,7 @@ def limit_to_reachable(dm: DeformableMirror, shape: NDArray[np.float64]) -> NDAr
     What is sent then stays in the span of the modes that the shape and the present shape consist of. The
     guard would clip single actuators instead, and the rest would be taken for a response of the modes.
 
-    Parameters
-    ----------
-    dm
-        The mirror.
-    shape
-        Command ``(n_act,)``.
+    ``shape``: command ``(n_act,)``.
     """
     now, target = dm.shape, shape * dm.largest_legal_scale(shape)
     slew, furthest = dm.limits.max_slew, float(np.abs(target - now).max(initial=0.0))
@@ -86,10 +76,7 @@ def limit_to_reachable(dm: DeformableMirror, shape: NDArray[np.float64]) -> NDAr
 def ramp_to(dm: DeformableMirror, shape: NDArray[np.float64]) -> SendReport:
     """Send a shape, scaled to obey the limits, in as many commands as the slew limit requires.
 
-    Returns
-    -------
-    SendReport
-        Report of the last command; its ``sent`` is the shape of the mirror.
+    Returns the report of the last command; its ``sent`` is the shape of the mirror.
     """
     while True:
         before = dm.shape
@@ -117,14 +104,8 @@ def build_interaction_matrix(
 ) -> InteractionMatrix:
     """Build an interaction matrix of this bench with its provenance.
 
-    Parameters
-    ----------
-    bench, grid, m2c
-        Bench, sensor geometry and mode-to-command matrix ``(n_act, n_modes)``.
-    data, sigma
-        Matrix and its standard errors ``(n_slopes, n_modes)``.
-    method, metrics
-        Name of the method, and numbers for the header.
+    ``bench``, ``grid``, ``m2c``: bench, sensor geometry and mode-to-command matrix ``(n_act, n_modes)``;
+    ``data``, ``sigma``: matrix and its standard errors ``(n_slopes, n_modes)``.
     """
     return InteractionMatrix(
         data.astype(np.float32),

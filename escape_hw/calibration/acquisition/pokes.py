@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, Protocol
+import abc
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,8 +22,10 @@ ANTICORRELATION = 0.6
 _FREQUENCIES = 2048
 
 
-class PokeSequence(Protocol):
-    """Sequence of pokes, built from the amplitude of each mode ``(n_modes,)`` and a random generator.
+class PokeSequence(abc.ABC):
+    """Sequence of pokes.
+
+    ``amplitude``: limit of the absolute poke of each mode ``(n_modes,)``; ``rng``: random generator.
 
     Attributes
     ----------
@@ -33,29 +36,18 @@ class PokeSequence(Protocol):
     method: ClassVar[str]
     title: ClassVar[str]
 
-    def __init__(self, amplitude: NDArray[np.float64], rng: np.random.Generator) -> None: ...
-
-    def __call__(self) -> NDArray[np.float64]:
-        """Poke of the next frame ``(n_modes,)``."""
-        ...
-
-
-class RandomPokes:
-    """Pokes on all modes in every frame, uniform and independent (DO-CRIME; Lai et al. 2020).
-
-    Parameters
-    ----------
-    amplitude
-        Limit of the absolute poke of each mode ``(n_modes,)``.
-    rng
-        Random generator.
-    """
-
-    method: ClassVar[str] = "docrime"
-    title: ClassVar[str] = "DO-CRIME"
-
     def __init__(self, amplitude: NDArray[np.float64], rng: np.random.Generator) -> None:
         self._amplitude, self._rng = amplitude, rng
+
+    @abc.abstractmethod
+    def __call__(self) -> NDArray[np.float64]:
+        """Poke of the next frame ``(n_modes,)``."""
+
+
+class RandomPokes(PokeSequence):
+    """Pokes on all modes in every frame, uniform and independent (DO-CRIME; Lai et al. 2020)."""
+
+    method, title = "docrime", "DO-CRIME"
 
     def __call__(self) -> NDArray[np.float64]:
         """Poke of the next frame ``(n_modes,)``."""
@@ -69,9 +61,7 @@ class AnticorrelatedPokes(RandomPokes):
     autoregression of the same rms). Modes are independent of each other and of the turbulence.
     """
 
-    def __init__(self, amplitude: NDArray[np.float64], rng: np.random.Generator) -> None:
-        super().__init__(amplitude, rng)
-        self._last: NDArray[np.float64] | None = None
+    _last: NDArray[np.float64] | None = None
 
     def __call__(self) -> NDArray[np.float64]:
         """Poke of the next frame ``(n_modes,)``."""
@@ -88,26 +78,18 @@ def select_random_pokes(kind: PokePattern) -> type[PokeSequence]:
     return AnticorrelatedPokes if kind == "anticorrelated" else RandomPokes
 
 
-class PushPullPokes:
+class PushPullPokes(PokeSequence):
     """Fast push-pull: one mode at a time, pushed and pulled in consecutive frames.
 
     Neither frame waits for the mirror to settle or for the turbulence to average out; the estimator assigns
     slopes to pokes, as with random pokes. The order of the modes and of push and pull is drawn anew in every
     round, so that turbulence does not affect the same mode each time.
-
-    Parameters
-    ----------
-    amplitude
-        Push and pull of each mode ``(n_modes,)``.
-    rng
-        Random generator.
     """
 
-    method: ClassVar[str] = "push-pull-fast"
-    title: ClassVar[str] = "fast push-pull"
+    method, title = "push-pull-fast", "fast push-pull"
 
     def __init__(self, amplitude: NDArray[np.float64], rng: np.random.Generator) -> None:
-        self._amplitude, self._rng = amplitude, rng
+        super().__init__(amplitude, rng)
         self._queue: list[tuple[int, float]] = []
         self._poke = np.zeros(amplitude.size)
 
@@ -198,12 +180,8 @@ def noise_gain(gain: float, leak: float, delay_frames: float) -> float:
     Mean over frequency of ``|1 / (1 + g z^-d / (1 - (1 - l) z^-1))|^2``: the loop measures the pokes like
     turbulence and corrects them with its delay.
 
-    Parameters
-    ----------
-    gain, leak
-        Effective gain of the loop, and leak.
-    delay_frames
-        Frames from a command to the slopes that show it.
+    ``gain``, ``leak``: effective gain of the loop, and leak; ``delay_frames``: frames from a command to the
+    slopes that show it.
     """
     phasor = np.exp(-2j * np.pi * (np.arange(_FREQUENCIES) + 0.5) / (2 * _FREQUENCIES))
     denominator = 1 - (1 - leak) * phasor

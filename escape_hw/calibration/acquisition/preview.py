@@ -21,12 +21,8 @@ MatrixEstimate = tuple[NDArray[np.floating], NDArray[np.floating]] | None
 class MatrixPreview:
     """Limits how often an estimate is previewed, and arranges it for display.
 
-    Parameters
-    ----------
-    n_modes
-        Modes of the complete matrix; those not measured yet are NaN.
-    grid
-        Returns the geometry of the slopes, or ``None`` while it is not known.
+    ``n_modes``: modes of the complete matrix; those not measured yet are NaN; ``grid``: returns the geometry
+    of the slopes, or ``None`` while it is not known.
     """
 
     def __init__(self, n_modes: int, grid: Callable[[], SensorGeometry | None]) -> None:

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from escape_hw.api.camera import Camera
 from escape_hw.api.modulator import Modulation
 from escape_hw.api.procedure import Procedure, Reporter
 from escape_hw.api.pyramid import PyramidPupils
@@ -31,46 +29,13 @@ SETUP_FRAMES = 200
 _MODULATION_TOLERANCE = 0.01
 
 
-class SensorKind(Protocol):
-    """What differs between kinds of wavefront sensors.
-
-    Attributes
-    ----------
-    search_target
-        What is found on the sensor's frames, for progress reports.
-    source_references
-        References on a calibration source, ``"mean"`` or ``"design"``.
-    uses_run_mean
-        Whether the mean frame of a whole run improves the geometry found on its first frames.
-    """
-
-    search_target: str
-    source_references: str
-    uses_run_mean: bool
-
-    def prepare(self, bench: Bench) -> None:
-        """Set the sensor up for a measurement."""
-        ...
-
-    def find(self, bench: Bench, mean_frame: NDArray[np.float32], references: str) -> SensorGeometry:
-        """Find the geometry on a calibrated mean frame; ``references`` is ``"design"`` or ``"mean"``."""
-        ...
-
-    def refine_geometry(
-        self, bench: Bench, grid: SensorGeometry, means: Sequence[NDArray[np.float32]]
-    ) -> SensorGeometry:
-        """Improve the geometry by calibrated mean frames of a run's parts; its slopes stay the same."""
-        ...
-
-    def build_slope_function(
-        self, bench: Bench, grid: SensorGeometry, shape: tuple[int, int], dark: NDArray[np.float32]
-    ) -> SlopeFunction:
-        """Build the slope function of this camera region ``shape`` (rows, columns)."""
-        ...
-
-
 class _ShackHartmann:
-    """Lenslets: spots on a lattice."""
+    """Lenslets: spots on a lattice.
+
+    ``search_target`` is what is found on mean frames; ``source_references`` are the references on a
+    calibration source, ``"mean"`` or ``"design"``; ``uses_run_mean``: the mean frame of a whole run improves
+    the geometry found on its first frames.
+    """
 
     search_target = "lenslet grid"
     # The lenslets are regular; deviations of their spots are aberrations, which a loop should correct.
@@ -116,7 +81,7 @@ class _ShackHartmann:
 
 
 class _Pyramid:
-    """A pyramid: four pupil images, and a modulator."""
+    """A pyramid: four pupil images, and a modulator; attributes as for :class:`_ShackHartmann`."""
 
     search_target = "pupil images"
     # A pyramid has no lattice; on a source its slopes are those of the flat wavefront.
@@ -180,8 +145,8 @@ def _current_modulation(bench: Bench) -> float:
     return 0.0 if now is None or section is None else now.radius_rad / section.rad_per_lambda_d
 
 
-def get_sensor_kind(bench: Bench) -> SensorKind:
-    """The kind of sensor of a bench."""
+def get_sensor_kind(bench: Bench) -> _Pyramid | _ShackHartmann:
+    """What differs between kinds of wavefront sensors, for the sensor of a bench."""
     section = bench.config.sensor
     return _Pyramid(section) if isinstance(section, PyramidSection) else _ShackHartmann(section)
 
@@ -234,8 +199,6 @@ def build_sensor_setup(
         background is estimated from the darkest pixels.
     mean_frame
         Mean of raw frames in counts ``(rows, columns)``.
-    references
-        As for :func:`find_sensor`.
 
     Raises
     ------
@@ -284,33 +247,10 @@ def build_slope_function(bench: Bench, grid: SensorGeometry) -> SlopeFunction:
     callbacks = bench.callbacks
     if callbacks.geometry is not None:
         callbacks.geometry(grid)
-    if callbacks.slopes is None:
-        return slopes_of
-    return _ObservedSlopeFunction(slopes_of, bench.wfs, callbacks.slopes)
-
-
-class _ObservedSlopeFunction:
-    """Slope function with a callback."""
-
-    def __init__(
-        self, slopes_of: SlopeFunction, camera: Camera, callback: Callable[[int, NDArray[np.float32]], object]
-    ) -> None:
-        self._slopes_of, self._camera, self._callback = slopes_of, camera, callback
-        self.grid, self.shape = slopes_of.grid, slopes_of.shape
-
-    @property
-    def flux(self) -> NDArray[np.float32]:
-        return self._slopes_of.flux
-
-    def __call__(
-        self,
-        frame: NDArray[np.uint16],
-        flux: NDArray[np.float32] | None = None,
-        out: NDArray[np.float32] | None = None,
-    ) -> NDArray[np.float32]:
-        slopes = self._slopes_of(frame, flux, out)
-        self._callback(self._camera.last_index, slopes)
-        return slopes
+    if callbacks.slopes is not None:
+        observer, camera = callbacks.slopes, bench.wfs
+        slopes_of.observer = lambda slopes: observer(camera.last_index, slopes)
+    return slopes_of
 
 
 def find_sensor(
@@ -320,8 +260,6 @@ def find_sensor(
 
     Parameters
     ----------
-    bench
-        An open bench.
     frames
         Number of frames to average.
     references
@@ -354,15 +292,6 @@ def ensure_sensor_ready(
     bench: Bench, grid: SensorGeometry | None, references: str = "design"
 ) -> Procedure[tuple[SensorGeometry, NDArray[np.float32] | None]]:
     """Flatten the mirror, prepare the sensor, and find its geometry unless it is given.
-
-    Parameters
-    ----------
-    bench
-        An open bench.
-    grid
-        The geometry, if it is known.
-    references
-        As for :func:`find_sensor`.
 
     Returns
     -------

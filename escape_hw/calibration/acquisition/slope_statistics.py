@@ -27,13 +27,7 @@ _FOCUS_INDEX = 2
 
 
 class SlopeStatistics:
-    """Running mean, rms and temporal correlation of the slopes, and the rms of the pokes.
-
-    Parameters
-    ----------
-    n_slopes
-        Number of slopes.
-    """
+    """Running mean, rms and temporal correlation of the slopes, and the rms of the pokes."""
 
     def __init__(self, n_slopes: int) -> None:
         self.n_slopes = n_slopes
@@ -154,13 +148,6 @@ class StaticFocusEstimator:
     aberrations have no rate. The square lattice of the instrument has focus (its pitch) but no astigmatism.
     Focus is regressed on the rates of both tilts and on both astigmatisms; the intercept is the static focus.
     The wind need not be known.
-
-    Parameters
-    ----------
-    grid
-        The sensor's grid.
-    frame_rate_hz
-        Frame rate of the sensor.
     """
 
     def __init__(self, grid: SubApertureGrid, frame_rate_hz: float) -> None:

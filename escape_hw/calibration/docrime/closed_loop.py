@@ -47,19 +47,7 @@ _CHECK_INTERVAL = 500
 
 
 class ClosedLoopAcquisition:
-    """A loop with injected pokes, and the estimator beside it.
-
-    Parameters
-    ----------
-    bench
-        An open bench.
-    matrix, grid
-        Matrix that closes the loop, and its geometry.
-    estimator
-        Closed-loop estimator.
-    monitor
-        Checkpoint and stopping criterion of the estimate.
-    """
+    """A loop with injected pokes, and the estimator beside it."""
 
     def __init__(
         self,
@@ -70,46 +58,33 @@ class ClosedLoopAcquisition:
         monitor: RunMonitor,
     ) -> None:
         self._grid, self._monitor, self._estimator = grid, monitor, estimator
-        self._loop = RunningLoop.prepare(bench, matrix, grid, build_integrator(bench, matrix, grid))
+        self.loop = RunningLoop.prepare(bench, matrix, grid, build_integrator(bench, matrix, grid))
         self._criterion_met = self._aborted = False
         self._preview = MatrixPreview(matrix.n_modes, lambda: grid)
         self._preview_arrays: Mapping[str, NDArray[np.float32]] = {}
-        self._estimator_thread = EstimatorThread(estimator, blocking=bench.simulated, on_block=self._on_block)
-
-    @property
-    def record(self) -> LoopRecord:
-        """Measurements of the loop."""
-        return self._loop.record
-
-    @property
-    def skipped(self) -> int:
-        """Frames that the estimate lost because its sums were behind."""
-        return self._estimator_thread.skipped
+        self.estimator_thread = EstimatorThread(estimator, blocking=bench.simulated, on_block=self._on_block)
 
     @property
     def grid(self) -> SensorGeometry:
         """The geometry with the slope statistics of the closed loop."""
-        return self._estimator_thread.slope_statistics.annotate_geometry(self._grid, closed=True)
+        return self.estimator_thread.slope_statistics.annotate_geometry(self._grid, closed=True)
 
     def restore(self, state: RunState) -> None:
         """Continue from a saved state."""
         self._estimator.restore(state.values, state.arrays)
-        self._estimator_thread.slope_statistics.restore(state.arrays["motion"])
+        self.estimator_thread.slope_statistics.restore(state.arrays["motion"])
 
     def poke(self, frames: int, pokes: PokeSequence, stage: str) -> Procedure[bool]:
         """Close the loop, inject pokes until the estimator has a number of frames, and open the loop.
 
-        Returns
-        -------
-        bool
-            Whether the run was aborted.
+        Returns whether the run was aborted.
 
         Raises
         ------
         CalibrationError
             The loop diverged, or the sensor went dark.
         """
-        loop, estimator_thread = self._loop, self._estimator_thread
+        loop, estimator_thread = self.loop, self.estimator_thread
         with loop.closed(), estimator_thread:
             try:
                 yield from loop.settle()
@@ -146,7 +121,7 @@ class ClosedLoopAcquisition:
 
     def _save_and_check(self, *, final: bool = False) -> bool:
         """Whether the criterion is met, without reporting progress; false if the run is aborted meanwhile."""
-        arrays = {"motion": self._estimator_thread.slope_statistics.state()}
+        arrays = {"motion": self.estimator_thread.slope_statistics.state()}
         frames_received = self._estimator.frames_received
         procedure = self._monitor.check(self._estimator, self.grid, frames_received, {}, arrays, final=final)
         while True:
@@ -187,29 +162,36 @@ def docrime_closed_run(
     closed_with = fingerprint(closed_loop.matrix.data)
     settings = {"poke": poke, "correlations": correlations, "closed with": closed_with}
     state = None if checkpoint is None else checkpoint.begin(bench, method, m2c, settings)
-    loop = ClosedLoopAcquisition(
+    acquisition = ClosedLoopAcquisition(
         bench, closed_loop.matrix, grid, estimator, RunMonitor(checkpoint, criterion)
     )
     if state is not None:
-        loop.restore(state)
+        acquisition.restore(state)
     stage = f"{pattern.title} in closed loop"
-    partial = yield from loop.poke(n_frames, pattern(amplitude, bench.rng), stage)
+    partial = yield from acquisition.poke(n_frames, pattern(amplitude, bench.rng), stage)
     try:
         solution = estimator.solve()
     except TooFewFrames:
         if partial:
             raise Aborted(f"aborted after {estimator.frames_received} frames, too few for a matrix") from None
         raise
-    residual = select_settled_residual(loop.record, bench.wfs.settings.frame_rate_hz)
+    record, skipped = acquisition.loop.record, acquisition.estimator_thread.skipped
+    residual = select_settled_residual(record, bench.wfs.settings.frame_rate_hz)
     matrix = build_solution_matrix(
-        bench, grid, m2c, solution, method, poke=float(poke), shortened=loop.record.shortened,
-        skipped=loop.skipped, loop_gain=bench.config.loop.gain,
+        bench, grid, m2c, solution, method, poke=float(poke), clipped_pokes=record.shortened,
+        skipped=skipped, loop_gain=bench.config.loop.gain,
         loop_residual_nm=float(np.sqrt(np.mean(np.square(residual)))) if residual.size else math.nan,
     )  # fmt: skip
     seconds = (solution.frames + solution.lost_frames) / bench.wfs.settings.frame_rate_hz
+    notes = [
+        *collect_solution_notes(solution, matrix),
+        *collect_loop_notes(record, bench.wfs.settings.frame_rate_hz),
+    ]
+    if skipped:
+        notes.append(f"the estimate skipped {skipped} frames, because its sums were behind the loop")
     result = CalibrationResult(
-        matrix, loop.grid, solution.frames, solution.lost_frames, seconds, solution.response,
-        partial=partial, notes=(*collect_solution_notes(solution, matrix), *_collect_loop_notes(bench, loop)),
+        matrix, acquisition.grid, solution.frames, solution.lost_frames, seconds, solution.response,
+        partial=partial, notes=tuple(notes),
     )  # fmt: skip
     return DocrimeRun(result, solution)
 
@@ -230,8 +212,6 @@ def docrime_closed_loop(
 
     Parameters
     ----------
-    bench
-        An open bench.
     closed_loop
         Calibration whose matrix closes the loop with the configured gain, leak and dropped modes; the
         measured matrix has its geometry and modes.
@@ -261,11 +241,3 @@ def docrime_closed_loop(
         checkpoint=checkpoint, criterion=criterion,
     )  # fmt: skip
     return run.result
-
-
-def _collect_loop_notes(bench: Bench, loop: ClosedLoopAcquisition) -> list[str]:
-    """Notes on the loop that qualify the measured matrix."""
-    notes = collect_loop_notes(loop.record, bench.wfs.settings.frame_rate_hz)
-    if loop.skipped:
-        notes.append(f"the estimate skipped {loop.skipped} frames, because its sums were behind the loop")
-    return notes

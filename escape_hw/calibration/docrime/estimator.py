@@ -7,15 +7,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from escape_hw.calibration.acquisition.telemetry import AlignedBuffer, AlignedTelemetry
+from escape_hw.calibration.acquisition.aligned_telemetry import AlignedBuffer, AlignedTelemetry
 from escape_hw.calibration.docrime.fit import (
     MIN_DEGREES_OF_FREEDOM,
     DocrimeSolution,
+    InitialFit,
     create_sums,
     estimate_preview,
     fit_first_frames,
@@ -40,12 +42,8 @@ class DocrimeEstimator:
 
     Parameters
     ----------
-    n_slopes, n_modes
-        Number of slopes and of modes.
     order
         Number of past frames that predict the turbulence; 0 for the paper's plain estimator.
-    lags
-        Number of lags of the temporal response.
     correlations
         Whether to sum the correlations of the slopes' noise, which the errors of SPRINT need. With many
         slopes this takes as much time as all the rest.
@@ -82,10 +80,9 @@ class DocrimeEstimator:
         self._excitation = np.zeros(2 * n_modes)
         self._unusable = 0
         self._next_index: int | None = None
-        self._whitener: NDArray[np.float64] | None = None
-        self._response: ResponseEstimate | None = None
+        #: Fit of the first frames, and the response since.
+        self._fit: InitialFit | None = None
         self._tracker: ResponseTracker | None = None
-        self._variance_inflation = 1.0
         self._sums = create_sums(n_slopes, n_modes, closed, correlations=correlations)
         self.frames = self.lost_frames = 0
 
@@ -213,21 +210,21 @@ class DocrimeEstimator:
 
     def state(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
         """Plain values and arrays for :meth:`restore`: the sums or, before there is a filter, the frames."""
-        if self._whitener is None or self._response is None or self._tracker is None:
+        if self._fit is None or self._tracker is None:
             data = self._buffer.telemetry()
             return {}, {"rows": data.rows.copy(), "present": data.present.copy()}
         self._update_sums()
         arrays: dict[str, NDArray[Any]] = {
-            "whitener": self._whitener,
-            "response": self._response.weights,
-            "response_covariance": self._response.covariance,
+            "whitener": self._fit.whitener,
+            "response": self._fit.response.weights,
+            "response_covariance": self._fit.response.covariance,
             **{f"sums.{name}": array.copy() for name, array in self._sums.arrays().items()},
             **{f"tracker.{name}": array.copy() for name, array in self._tracker.arrays().items()},
         }
         values = {
             "frames": self.frames,
             "lost_frames": self.lost_frames,
-            "spread": self._variance_inflation,
+            "spread": self._fit.variance_inflation,
             "count": self._sums.count,
         }
         return values, arrays
@@ -248,10 +245,10 @@ class DocrimeEstimator:
             self.mark_pause()
             return
         self.frames, self.lost_frames = int(values["frames"]), int(values["lost_frames"])
-        self._whitener, self._variance_inflation = arrays["whitener"], float(values["spread"])
-        self._response = ResponseEstimate(arrays["response"], arrays["response_covariance"])
+        response = ResponseEstimate(arrays["response"], arrays["response_covariance"])
+        self._fit = InitialFit(arrays["whitener"], response, float(values["spread"]))
         spectra = np.zeros((self.n_modes if self.closed else 1, self.lags, self.lags))
-        self._tracker, self._sums.count = ResponseTracker(self._response, spectra), int(values["count"])
+        self._tracker, self._sums.count = ResponseTracker(response, spectra), int(values["count"])
         for prefix, target in (("sums", self._sums.arrays()), ("tracker", self._tracker.arrays())):
             for name, array in target.items():
                 saved = arrays.get(f"{prefix}.{name}")
@@ -286,13 +283,13 @@ class DocrimeEstimator:
         """
         self._update_sums()
         needed = self.n_modes + self.lags + MIN_DEGREES_OF_FREEDOM
-        if self._whitener is None or self._tracker is None or self._sums.count < needed:
+        if self._fit is None or self._tracker is None or self._sums.count < needed:
             raise TooFewFrames(
                 f"{self._sums.count} complete frames cannot constrain {self.n_modes} modes; "
                 f"at least {needed + self.order + self.lags} frames are needed"
             )
         return solve_sums(
-            self._sums, self._tracker, self._whitener, self._variance_inflation,
+            self._sums, self._tracker, self._fit,
             lags=self.lags, frames=self.frames, lost_frames=self.lost_frames,
         )  # fmt: skip
 
@@ -301,47 +298,44 @@ class DocrimeEstimator:
 
         Does not change the state, so previews do not affect the result of a run.
         """
-        if self._tracker is None:
+        if self._fit is None or self._tracker is None:
             return None
-        scale = self._tracker.scale(self._tracker.response())
-        return estimate_preview(self._sums, scale, self.lags, self._variance_inflation)
+        return estimate_preview(self._sums, self._tracker, self._fit.variance_inflation, self.lags)
 
     def _update_sums(self) -> None:
         """Add the buffered frames to the sums, after fitting response and filter if they are unknown."""
         buffer = self._buffer
         data, start = buffer.telemetry(), buffer.n_retained
         self.frames += buffer.n_new
-        if self._response is None:
+        if self._fit is None:
             start = 0
             fit = fit_first_frames(data, self.order, self.lags)
-            if fit is not None:
-                self._whitener, self._variance_inflation = fit.whitener, fit.variance_inflation
-                known = self._known_response
-                self._response = fit.response if known is None else fit.response.combine_with(known)
-        if self._response is not None:
-            self._add_rows(data, start)
-        buffer.retain_last(buffer.n_filled if self._response is None else self._history_rows())
-        if self._response is None:
+            if fit is not None and self._known_response is not None:
+                fit = replace(fit, response=fit.response.combine_with(self._known_response))
+            self._fit = fit
+        if self._fit is None:
             # Too few frames: the next call uses them again.
+            buffer.retain_last(buffer.n_filled)
             buffer.resize(buffer.n_filled + BURN_IN_FRAMES)
-        elif start == 0:
+            return
+        self._add_rows(data, start, self._fit)
+        buffer.retain_last(self._history_rows())
+        if start == 0:
             buffer.resize(buffer.n_filled + BLOCK)
 
-    def _add_rows(self, data: AlignedTelemetry, start: int) -> None:
+    def _add_rows(self, data: AlignedTelemetry, start: int, fit: InitialFit) -> None:
         """Add the rows from ``start`` on to the sums, and to the temporal response."""
-        if self._whitener is None or self._response is None:
-            raise RuntimeError("sums need the filter and the response")
-        block = filter_telemetry(data, self._whitener, self.lags, start)
+        block = filter_telemetry(data, fit.whitener, self.lags, start)
         if not block.now.size:
             return
         # Without a filter the differences of the first frames give the more accurate response.
         if self._tracker is not None and self.order:
-            before = self._sums.centred_sample()
+            before = self._sums.sampled().subtract_means()
             matrix = before.solve()
             self._tracker.add(block, matrix, before.signal_power(matrix))
-        self._sums.add(block.slopes, block.excitation(self._response.weights))
+        self._sums.add(block.slopes, block.excitation(fit.response.weights))
         if self._tracker is None:
-            self._tracker = ResponseTracker(self._response, compute_lag_covariances(block, self.lags))
+            self._tracker = ResponseTracker(fit.response, compute_lag_covariances(block, self.lags))
 
 
 def _not_finite(index: int) -> ValueError:

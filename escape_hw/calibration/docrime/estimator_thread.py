@@ -41,8 +41,6 @@ class EstimatorThread:
 
     Attributes
     ----------
-    slope_statistics
-        Statistics of the slopes in the estimate.
     skipped
         Number of frames skipped because the queue was full.
     """

@@ -10,7 +10,7 @@ from scipy.linalg import lapack
 
 from escape_hw.api.representation import short_repr
 from escape_hw.api.results import TemporalResponse
-from escape_hw.calibration.acquisition.telemetry import AlignedTelemetry
+from escape_hw.calibration.acquisition.aligned_telemetry import AlignedTelemetry
 from escape_hw.calibration.docrime.regression import InstrumentalVariableSums, RegressionSums
 from escape_hw.calibration.docrime.response import (
     RESPONSE_SLOPES,
@@ -55,8 +55,6 @@ def require_response(
         Least-squares matrix ``(n_slopes, n_modes)``.
     covariance
         Covariance of the noise of one frame's slopes ``(n_slopes, n_slopes)``.
-    lags
-        Number of lags of the response.
 
     Raises
     ------
@@ -96,8 +94,6 @@ def variance_inflation(
         Pokes through the temporal response ``(n, n_modes)``.
     at
         Time of each row in frames ``(n,)``, increasing.
-    lags
-        Number of lags of the response.
     """
     centred = noise - noise.mean(axis=0)
     factor = 1.0
@@ -118,14 +114,8 @@ def _correlation(values: NDArray[np.floating], now: NDArray[np.intp], past: NDAr
 class InitialFit:
     """Fit of the first frames.
 
-    Parameters
-    ----------
-    whitener
-        Filter over time ``(order + 1,)``.
-    response
-        Temporal response.
-    variance_inflation
-        Factor on the variance of an estimate whose noise is not white.
+    ``whitener``: filter over time ``(order + 1,)``; ``variance_inflation``: factor on the variance of an
+    estimate whose noise is not white.
     """
 
     whitener: NDArray[np.float64]
@@ -143,19 +133,7 @@ def create_sums(n_slopes: int, n_modes: int, closed: bool, *, correlations: bool
 def fit_first_frames(data: AlignedTelemetry, order: int, lags: int) -> InitialFit | None:
     """Estimate temporal response and whitening filter, first from frame differences, then iteratively.
 
-    Parameters
-    ----------
-    data
-        Telemetry so far.
-    order
-        Number of past frames that predict the turbulence; 0 for no filter.
-    lags
-        Number of lags of the temporal response.
-
-    Returns
-    -------
-    InitialFit or None
-        ``None`` if there are too few frames.
+    Returns ``None`` if there are too few frames.
 
     Raises
     ------
@@ -230,24 +208,13 @@ def require_excitation(gram: NDArray[np.floating]) -> None:
 
 
 def estimate_preview(
-    sums: RegressionSums, scale: NDArray[np.float64], lags: int, variance_inflation: float
+    sums: RegressionSums, tracker: ResponseTracker, variance_inflation: float, lags: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
     """Estimate matrix and standard errors ``(n_slopes, n_modes)`` from sums, which are not changed.
 
-    Parameters
-    ----------
-    sums
-        Sums of a running measurement.
-    scale
-        Factors on the columns ``(n_modes,)`` or ``(1,)``.
-    lags, variance_inflation
-        Number of lags of the temporal response, and factor on the variance.
-
-    Returns
-    -------
-    tuple or None
-        ``None`` if there are too few frames, or the pokes do not span the modes yet.
+    ``None`` if there are too few frames, or the pokes do not span the modes yet.
     """
+    scale = tracker.scale(tracker.response())
     if sums.count < scale.size + lags + MIN_DEGREES_OF_FREEDOM:
         return None
     power = sums.power if sums.power.ndim == 1 else np.diag(sums.power).copy()
@@ -271,8 +238,6 @@ class DocrimeSolution:
     matrix, sigma
         Slopes per unit mode ``(n_slopes, n_modes)``, and standard errors of its elements, without that of
         their common gain.
-    response
-        Temporal response.
     covariance
         Covariance of one frame's filtered residual slopes ``(n_slopes, n_slopes)``; ``None`` if the
         correlations were not summed.
@@ -283,8 +248,6 @@ class DocrimeSolution:
         Variance of each slope's filtered noise, including the variance inflation ``(n_slopes,)``.
     whitener
         Filter ``(order + 1,)``, ``[1]`` for the plain estimator.
-    frames, lost_frames
-        Number of frames used, and lost by the camera.
     gain_sigma
         Relative standard error of the common gain, by the errors of the temporal response.
     response_covariance
@@ -308,8 +271,7 @@ class DocrimeSolution:
 def solve_sums(
     raw_sums: RegressionSums,
     tracker: ResponseTracker,
-    whitener: NDArray[np.float64],
-    variance_inflation: float,
+    fit: InitialFit,
     *,
     lags: int,
     frames: int,
@@ -317,20 +279,8 @@ def solve_sums(
 ) -> DocrimeSolution:
     """Solve sums for the matrix, its standard errors and the temporal response.
 
-    Parameters
-    ----------
-    raw_sums
-        Sums over all filtered frames; not changed.
-    tracker
-        Temporal response over the same frames.
-    whitener
-        Filter ``(order + 1,)``. With one weight only, the response is not tested for significance.
-    variance_inflation
-        Factor on the variance of an estimate whose noise is not white.
-    lags
-        Number of lags of the temporal response.
-    frames, lost_frames
-        Number of frames used and lost.
+    ``raw_sums``, ``tracker``: sums and temporal response over all filtered frames; not changed; ``fit``: fit
+    of the first frames. Without a whitening filter the response is not tested for significance.
 
     Raises
     ------
@@ -342,12 +292,12 @@ def solve_sums(
     require_excitation(information)
     matrix = sums.solve()
     dof = sums.degrees_of_freedom() - lags
-    if whitener.size > 1:
+    if fit.whitener.size > 1:
         rows, power = sums.sample(matrix)
         require_response(information, rows, power / dof, lags)
     residual = sums.residual_power(matrix) / dof
     covariance = residual if residual.ndim == 2 else None
-    variance = np.maximum(residual if covariance is None else np.diag(residual), 0.0) * variance_inflation
+    variance = np.maximum(residual if covariance is None else np.diag(residual), 0.0) * fit.variance_inflation
     sigma = np.outer(np.sqrt(variance), np.sqrt(sums.inverse_diagonal()))
     response = tracker.response()
     scale = tracker.scale(response)
@@ -358,7 +308,7 @@ def solve_sums(
         covariance,
         information / np.multiply.outer(scale, scale),
         variance,
-        whitener,
+        fit.whitener,
         frames,
         lost_frames,
         tracker.gain_sigma(response),

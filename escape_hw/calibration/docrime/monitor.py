@@ -22,15 +22,7 @@ StoppingCriterion = Callable[[DocrimeSolution, SensorGeometry], Procedure[bool]]
 
 
 class RunMonitor:
-    """Saves the state of a run when it is time, and evaluates its stopping criterion.
-
-    Parameters
-    ----------
-    checkpoint
-        Where the state is saved; ``None``: it is not saved.
-    criterion
-        Stopping criterion; ``None``: the run goes on to its number of frames.
-    """
+    """Saves the state of a run when it is time, and evaluates its stopping criterion."""
 
     def __init__(self, checkpoint: Checkpoint | None, criterion: StoppingCriterion | None) -> None:
         self._checkpoint, self._criterion, self._next_check = checkpoint, criterion, 0
@@ -52,21 +44,10 @@ class RunMonitor:
     ) -> Procedure[bool]:
         """Save the state and evaluate the criterion, as far as either is due.
 
-        Parameters
-        ----------
-        estimator, grid
-            Running estimate and sensor geometry.
-        frames
-            Number of frames so far.
-        values, arrays
-            Entries of the state beside the estimator's own.
-        final
-            The run ends here: save the state in any case and do not evaluate the criterion.
+        ``values``, ``arrays``: entries of the state beside the estimator's own; ``final``: the run ends here:
+        save the state in any case and do not evaluate the criterion.
 
-        Returns
-        -------
-        bool
-            Whether the criterion is met.
+        Returns whether the criterion is met.
         """
         if self._checkpoint is not None and (final or self._checkpoint.is_due()):
             own_values, own_arrays = estimator.state()

@@ -65,13 +65,9 @@ def docrime_run(
     ----------
     bench, frames, poke, whiten, grid, pattern, checkpoint
         As for :func:`docrime`.
-    record
-        Whether to return the telemetry.
     correlations
         Whether to estimate the correlations of the slopes' noise, up to
         :data:`~escape_hw.calibration.docrime.regression.MAX_CORRELATED_SLOPES` slopes.
-    criterion
-        Stopping criterion.
     """
     c = bench.config.calibration
     n_frames = c.frames if frames is None else validate_frame_count(frames)
@@ -97,18 +93,18 @@ def docrime_run(
     if state is not None:
         acquisition.restore(state)
     partial = yield from acquisition.poke(n_frames, pattern(amplitude, bench.rng), pattern.title)
-    acquisition.process_pending()
-    if acquisition.estimator is None or acquisition.grid is None or acquisition.slope_statistics is None:
-        raise Aborted("aborted before the first frames")
+    sensor = acquisition.sensor
+    if sensor.estimator is None:
+        raise RuntimeError("the acquisition has no estimator")
     try:
-        solution = acquisition.estimator.solve()
+        solution = sensor.estimator.solve()
     except TooFewFrames:
         if partial:
             raise Aborted(f"aborted after {acquisition.n_received} frames, too few for a matrix") from None
         raise
     method = pattern.method + ("-whitened" if whiten and issubclass(pattern, RandomPokes) else "")
     matrix = build_solution_matrix(
-        bench, acquisition.grid, m2c, solution, method, poke=float(poke), shortened=acquisition.shortened
+        bench, sensor.grid, m2c, solution, method, poke=float(poke), clipped_pokes=acquisition.shortened
     )
     return DocrimeRun(_result(acquisition, matrix, solution, partial), solution, acquisition.record())
 
@@ -124,7 +120,7 @@ def build_solution_matrix(
     """Build the interaction matrix of a solution with its provenance and metrics."""
     return build_interaction_matrix(
         bench, grid, m2c, solution.matrix, solution.sigma, method,
-        frames=solution.frames, lost_frames=solution.lost_frames, delay_frames=solution.response.delay,
+        frames=solution.frames, lost_frames=solution.lost_frames, delay_frames=solution.response.delay_frames,
         whitening_order=solution.whitener.size - 1, gain_sigma=solution.gain_sigma, **metrics,
     )  # fmt: skip
 
@@ -177,7 +173,7 @@ def _result(
         seconds,
         solution.response,
         partial=partial,
-        mean_frame=acquisition.mean_frame,
+        mean_frame=acquisition.sensor.mean_frame,
         notes=(*collect_solution_notes(solution, matrix), *acquisition.notes()),
     )
 

@@ -19,7 +19,7 @@ which depends on the pokes alone, after ``D (sum x z^T - c sum z z^T)`` was subt
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any, Self
 
 import numpy as np
@@ -100,8 +100,6 @@ class RegressionSums:
         Slopes times slopes of at most :data:`N_SAMPLED_SLOPES` evenly spaced slopes.
     slopes, pokes
         Sums of the slopes ``(n_slopes,)`` and of the pokes ``(n_modes,)``.
-    count
-        Number of frames.
     """
 
     cross: NDArray[np.float64]
@@ -133,7 +131,7 @@ class RegressionSums:
         """
         self.cross += slopes.T @ pokes
         self.gram += pokes.T @ pokes
-        self.power += slopes.T @ slopes if self.power.ndim == 2 else np.einsum("ts,ts->s", slopes, slopes)
+        self.power += _products(slopes, self.power.ndim)
         few = np.ascontiguousarray(slopes[:, :: sampling_step(slopes.shape[1])])
         self.few += few.T @ few
         ones = np.ones(len(slopes), np.float32)
@@ -157,16 +155,10 @@ class RegressionSums:
             self.count,
         )
 
-    def centred_sample(self) -> Self:
-        """Return the sums about the means for the sampled slopes alone."""
+    def sampled(self) -> Self:
+        """Return the sums for the sampled slopes alone, with their correlations."""
         step = sampling_step(self.slopes.size)
-        few, n = self.slopes[::step], max(self.count, 1)
-        power = self.few - np.outer(few, few) / n
-        return type(self)(
-            self.cross[::step] - np.outer(few, self.pokes) / n,
-            self.gram - np.outer(self.pokes, self.pokes) / n,
-            power, power, np.zeros_like(few), np.zeros_like(self.pokes), self.count,
-        )  # fmt: skip
+        return replace(self, cross=self.cross[::step], power=self.few, slopes=self.slopes[::step])
 
     def signal_power(self, matrix: NDArray[np.float64]) -> NDArray[np.float64]:
         """Sum of squares of each column of the solved matrix without that of noise ``(n_modes,)``."""
@@ -210,8 +202,8 @@ class RegressionSums:
 
     def sample(self, matrix: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """The sampled rows of the solved matrix, and the sum of their residuals times residuals."""
-        step = sampling_step(len(matrix))
-        return matrix[::step], np.asarray(self.few - self.cross[::step] @ matrix[::step].T)
+        rows = matrix[:: sampling_step(len(matrix))]
+        return rows, self.sampled().residual_power(rows)
 
 
 class InstrumentalVariableSums(RegressionSums):
@@ -239,13 +231,12 @@ class InstrumentalVariableSums(RegressionSums):
 
     def residual_power(self, matrix: NDArray[np.float64]) -> NDArray[np.float64]:
         """Sum of residuals times residuals, of the shape of ``power``."""
-        return _residual_power(self.power, self.cross[:, : matrix.shape[1]], self._command_products(), matrix)
-
-    def sample(self, matrix: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """The sampled rows of the matrix, and the sum of their residuals times residuals."""
-        step = sampling_step(len(matrix))
-        rows, cross = matrix[::step], self.cross[::step, : matrix.shape[1]]
-        return rows, _residual_power(self.few, cross, self._command_products(), rows)
+        cross, gram = self.cross[:, : matrix.shape[1]], self._command_products()
+        if self.power.ndim == 1:
+            explained = np.einsum("sm,sm->s", matrix @ gram, matrix)
+            return np.asarray(self.power - 2 * np.einsum("sm,sm->s", cross, matrix) + explained)
+        cross_products = cross @ matrix.T
+        return np.asarray(self.power - cross_products - cross_products.T + matrix @ gram @ matrix.T)
 
     def _command_products(self) -> NDArray[np.float64]:
         """``sum x x^T`` ``(n_modes, n_modes)``."""
@@ -288,11 +279,9 @@ class ForgettingSums(InstrumentalEquations):
 
     def forget(self, factor: float) -> None:
         """Multiply the weights of all frames so far by ``factor``."""
-        self.cross *= factor
-        self.command_poke_products *= factor
-        self.poke_products *= factor
+        for array in (self.cross, self.command_poke_products, self.poke_products, self.residual_products):
+            array *= factor
         self.gram *= factor**2
-        self.residual_products *= factor
         self.weight *= factor
 
     def add(
@@ -314,24 +303,21 @@ class ForgettingSums(InstrumentalEquations):
         """
         y, x, z = (part - part.mean(axis=0) for part in (slopes, command, poke))
         residual = y - x @ matrix.T
-        block = InstrumentalEquations.from_rows(y, x, z)
-        self.cross += block.cross
-        self.command_poke_products += block.command_poke_products
-        self.poke_products += block.poke_products
-        self.gram += block.poke_products
-        is_square = self.residual_products.ndim == 2
-        self.residual_products += (
-            residual.T @ residual if is_square else np.einsum("ts,ts->s", residual, residual)
-        )
-        self.weight += len(y)
+        sums = InstrumentalEquations.from_rows(y, x, z)
+        residual_products = _products(residual, self.residual_products.ndim)
+        self.merge(
+            ForgettingSums(
+                sums.cross, sums.command_poke_products, sums.poke_products, sums.poke_products,
+                residual_products, len(y),
+            )
+        )  # fmt: skip
 
     def merge(self, other: ForgettingSums) -> None:
         """Add the sums of other frames."""
-        self.cross += other.cross
-        self.command_poke_products += other.command_poke_products
-        self.poke_products += other.poke_products
-        self.gram += other.gram
-        self.residual_products += other.residual_products
+        for field in fields(self):
+            if field.name != "weight":
+                array = getattr(self, field.name)
+                array += getattr(other, field.name)
         self.weight += other.weight
 
     @property
@@ -348,17 +334,9 @@ class ForgettingSums(InstrumentalEquations):
     def build_columns(self, template: InteractionMatrix, matrix: NDArray[np.float64]) -> InteractionMatrix:
         """Build a matrix from the sums whose columns have equal, independent errors.
 
-        Parameters
-        ----------
-        template
-            Any matrix of this sensor and basis, for mask, basis and provenance.
-        matrix
-            The best known matrix ``(n_slopes, n_modes)``, for the controller's part.
+        ``matrix``: the best known matrix ``(n_slopes, n_modes)``, for the controller's part.
 
-        Returns
-        -------
-        InteractionMatrix
-            ``(n_slopes, rank)``, its modes rotated and not of unit rms.
+        Returns ``(n_slopes, rank)``, its modes rotated and not of unit rms.
         """
         factor = float(np.median(np.diag(self.command_poke_products) / np.diag(self.poke_products)))
         cross = self.poke_response(matrix, factor)
@@ -395,19 +373,9 @@ def whiten_columns(
     )
 
 
-def _residual_power(
-    power: NDArray[np.float64],
-    cross: NDArray[np.float64],
-    gram: NDArray[np.float64],
-    matrix: NDArray[np.float64],
-) -> NDArray[np.float64]:
-    """``sum (y - D x) (y - D x)^T`` from its parts, or the diagonal of it."""
-    if power.ndim == 1:
-        return np.asarray(
-            power - 2 * np.einsum("sm,sm->s", cross, matrix) + np.einsum("sm,sm->s", matrix @ gram, matrix)
-        )
-    cross_products = cross @ matrix.T
-    return np.asarray(power - cross_products - cross_products.T + matrix @ gram @ matrix.T)
+def _products(rows: NDArray[Any], dimensions: int) -> NDArray[Any]:
+    """Sum over rows ``(n, n_columns)`` of their outer products, or the diagonal of it in one dimension."""
+    return np.asarray(rows.T @ rows if dimensions == 2 else np.einsum("ts,ts->s", rows, rows))
 
 
 def sampling_step(n_slopes: int) -> int:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.linalg import toeplitz
 
 from escape_hw.api.results import TemporalResponse
-from escape_hw.calibration.acquisition.telemetry import AlignedTelemetry
+from escape_hw.calibration.acquisition.aligned_telemetry import AlignedTelemetry, TelemetryRows
 from escape_hw.calibration.docrime.regression import N_SAMPLED_SLOPES, InstrumentalEquations, sampling_step
 from escape_hw.calibration.docrime.whitening import apply_filter
 from escape_hw.errors import CalibrationError
@@ -66,11 +66,6 @@ class LagSums:
     The products ``z_l y`` and ``z_l x_k`` of each frame are summed, and also the products of these with each
     other. The latter give the covariance of the scores for any weights (White 1980), with errors that are
     correlated between slopes and independent between frames.
-
-    Parameters
-    ----------
-    lags
-        Number of lags.
     """
 
     def __init__(self, lags: int) -> None:
@@ -134,48 +129,21 @@ class LagSums:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class FilteredTelemetry:
-    """Slopes, commands and pokes filtered over time.
+class FilteredTelemetry(TelemetryRows):
+    """Slopes, commands and pokes filtered over time ``(n_rows, ...)``.
 
-    Parameters
-    ----------
-    rows
-        Filtered slopes and commands ``(n_rows, n_slopes + n_modes)``, in closed loop with the filtered pokes
-        beside them.
-    now
-        Usable rows: their slopes and their commands of all lags are known ``(n,)``, increasing.
-    n_slopes, n_modes
-        Number of columns with slopes, and with commands.
+    ``now (n,)``, increasing, are the usable rows: their slopes and their commands of all lags are known.
     """
 
     rows: NDArray[np.float32]
     now: NDArray[np.intp]
     n_slopes: int
-    n_modes: int
+    closed: bool
 
     @property
     def slopes(self) -> NDArray[np.float32]:
         """Slopes of the usable rows ``(n, n_slopes)``."""
-        return self.rows_before(0)[:, : self.n_slopes]
-
-    @property
-    def commands(self) -> NDArray[np.float32]:
-        """Commands of all rows ``(n_rows, n_modes)``."""
-        return self.rows[:, self.n_slopes : self.n_slopes + self.n_modes]
-
-    @property
-    def pokes(self) -> NDArray[np.float32]:
-        """Pokes of all rows ``(n_rows, n_modes)``; in open loop these are the commands."""
-        return self.rows[:, self.rows.shape[1] - self.n_modes :]
-
-    @property
-    def closed(self) -> bool:
-        """Whether the telemetry is of a closed loop."""
-        return bool(self.rows.shape[1] > self.n_slopes + self.n_modes)
-
-    def rows_before(self, lag: int) -> NDArray[np.float32]:
-        """Rows that precede the usable ones by ``lag`` rows."""
-        return shift_rows(self.rows, self.now, lag)
+        return shift_rows(self.rows, self.now, 0)[:, : self.n_slopes]
 
     def excitation(self, response: NDArray[np.float64]) -> NDArray[np.float32]:
         """Commands through a response at the usable rows ``(n, n_modes)``; in closed loop also pokes."""
@@ -201,8 +169,6 @@ def filter_telemetry(
 
     Parameters
     ----------
-    data
-        Telemetry.
     whitener
         Filter ``(order + 1,)``.
     lags
@@ -215,7 +181,7 @@ def filter_telemetry(
     at = at[np.searchsorted(at, start) :]
     first = max(start - lags, order)
     rows = apply_filter(data.rows, whitener, np.arange(first, data.present.size))
-    return FilteredTelemetry(rows, at - first, data.n_slopes, data.n_modes)
+    return FilteredTelemetry(rows, at - first, data.n_slopes, data.closed)
 
 
 def compute_lag_covariances(data: FilteredTelemetry, lags: int) -> NDArray[np.float64]:
@@ -246,19 +212,7 @@ def fit_response(data: AlignedTelemetry, whitener: NDArray[np.float64], lags: in
     scales all weights alike, and they are scaled to sum 1. In closed loop the pokes are the instruments of
     the commands, for the matrix and for the weights.
 
-    Parameters
-    ----------
-    data
-        Telemetry with enough rows for a matrix in each half (see :func:`find_usable_rows`).
-    whitener
-        Filter over time ``(order + 1,)``.
-    lags
-        Number of lags.
-
-    Returns
-    -------
-    ResponseEstimate
-        Its errors allow for correlations between slopes.
+    The errors of the result allow for correlations between slopes.
     """
     sums = LagSums(lags)
     for part in fit_halves(filter_telemetry(data.select_slopes(RESPONSE_SLOPES), whitener, lags), lags):
@@ -276,14 +230,8 @@ def predict_slopes(
     of each mode have their own spectrum, noisy modes would weigh too much and bias the lags. There each mode
     is shrunk by the ratio of its power without and with noise.
 
-    Parameters
-    ----------
-    data
-        Filtered telemetry.
-    matrix
-        Matrix whose errors are independent of the noise of these frames ``(n_modes, n_slopes)``.
-    power
-        Sum of squares of each mode's column without its noise ``(n_modes,)``.
+    ``matrix``: matrix whose errors are independent of the noise of these frames ``(n_modes, n_slopes)``;
+    ``power``: sum of squares of each mode's column without its noise ``(n_modes,)``.
 
     Returns
     -------
@@ -317,8 +265,6 @@ class HalfFit:
         Predictions from commands and from pokes for all rows ``(n_rows, n_slopes)``, of any scale.
     now
         Indices of the half's rows among all ``(n,)``.
-    sums
-        Regression of the slopes on the predictions.
     """
 
     slopes: NDArray[np.float32]
@@ -334,15 +280,15 @@ def fit_halves(sampled: FilteredTelemetry, lags: int) -> list[HalfFit]:
     slopes = sampled.slopes - sampled.slopes.mean(axis=0)
     commands = sampled.commands - sampled.commands.mean(axis=0)
     pokes = sampled.pokes - sampled.pokes.mean(axis=0) if sampled.closed else commands
-    best_lag = _find_strongest_lag(slopes, pokes, now, lags)
+    few = np.ascontiguousarray(slopes[:, ::3])
+    powers = [np.square(few.T @ shift_rows(pokes, now, lag)).sum() for lag in range(lags)]
+    best_lag = int(np.argmax(powers))
     middle = now.size // 2
     parts = [slice(0, middle), slice(middle, now.size)]
-    matrices = [
-        _instrumental_matrix(
-            slopes[part], shift_rows(commands, now[part], best_lag), shift_rows(pokes, now[part], best_lag)
-        )
-        for part in parts
-    ]
+    matrices = []
+    for part in parts:
+        rows = (shift_rows(excitation, now[part], best_lag) for excitation in (commands, pokes))
+        matrices.append(InstrumentalEquations.from_rows(slopes[part], *rows).solve(_DAMPING).T)
     # The noise of the two halves is independent.
     power = np.einsum("ms,ms->m", *matrices, dtype=np.float64)
     fits = []
@@ -363,31 +309,13 @@ def stack_lags(rows: NDArray[np.float32], now: NDArray[np.intp], lags: int) -> N
     return np.stack([shift_rows(rows, now, lag) for lag in range(lags)], axis=1)
 
 
-def _find_strongest_lag(
-    slopes: NDArray[np.float32], pokes: NDArray[np.float32], now: NDArray[np.intp], lags: int
-) -> int:
-    sampled = np.ascontiguousarray(slopes[:, ::3])
-    return int(np.argmax([np.square(sampled.T @ shift_rows(pokes, now, lag)).sum() for lag in range(lags)]))
-
-
-def _instrumental_matrix(
-    slopes: NDArray[np.float32], commands: NDArray[np.float32], pokes: NDArray[np.float32]
-) -> NDArray[np.float32]:
-    """Damped matrix ``(n_modes, n_slopes)`` with pokes as instruments of the commands."""
-    return InstrumentalEquations.from_rows(slopes, commands, pokes).solve(_DAMPING).T
-
-
 class ResponseTracker:
     """Estimates the temporal response during a run.
 
     The matrix of all frames so far predicts the next ones, whose noise is independent of its errors.
 
-    Parameters
-    ----------
-    first
-        Response of the first frames, which the sums of the matrix assume.
-    spectra
-        Output of :func:`compute_lag_covariances` for the first frames.
+    ``first``: response of the first frames, which the sums of the matrix assume; ``spectra``: output of
+    :func:`compute_lag_covariances` for the first frames.
     """
 
     def __init__(self, first: ResponseEstimate, spectra: NDArray[np.float64]) -> None:
@@ -398,14 +326,7 @@ class ResponseTracker:
     def add(self, data: FilteredTelemetry, matrix: NDArray[np.float64], power: NDArray[np.float64]) -> None:
         """Add a block of filtered telemetry, with the rows of the lags before it.
 
-        Parameters
-        ----------
-        data
-            The block.
-        matrix
-            Matrix of the frames before it for the sampled slopes ``(n_few, n_modes)``.
-        power
-            As for :func:`predict_slopes`.
+        ``matrix``: matrix of the frames before it for the sampled slopes ``(n_few, n_modes)``.
         """
         step, lags = sampling_step(data.n_slopes), self._first.weights.size
         slopes = data.slopes[:, ::step]
@@ -448,15 +369,6 @@ def require_no_late_response(data: AlignedTelemetry, whitener: NDArray[np.float6
     with the wrong size or sign. Its remainder in the slopes is correlated with the pokes of later lags; noise
     is not.
 
-    Parameters
-    ----------
-    data
-        Telemetry.
-    whitener
-        Filter over time ``(order + 1,)``.
-    lags
-        Number of lags of the temporal response.
-
     Raises
     ------
     CalibrationError
@@ -497,11 +409,6 @@ class ResponseAccumulator:
 
     Slopes are regressed on the predictions of a matrix from the commands, with its predictions from the pokes
     as instruments.
-
-    Parameters
-    ----------
-    lags
-        Number of lags.
     """
 
     def __init__(self, lags: int) -> None:
@@ -511,12 +418,7 @@ class ResponseAccumulator:
     def add(self, block: FilteredTelemetry, matrix: NDArray[np.float64]) -> None:
         """Add a block of filtered telemetry with the rows of the lags before it.
 
-        Parameters
-        ----------
-        block
-            Telemetry of a closed loop.
-        matrix
-            The best known matrix ``(n_slopes, n_modes)``.
+        ``matrix``: the best known matrix ``(n_slopes, n_modes)``.
         """
         stride = sampling_step(block.n_slopes)
         sampled_matrix = matrix[::stride].T.astype(np.float32)

@@ -22,19 +22,9 @@ def fit_prediction_error_filter(
     inaccurate when frames are lost, since turbulence is smooth. One filter for all slopes keeps generalised
     and ordinary least squares equal across slopes for any correlation (Zellner 1962: equal regressors).
 
-    Parameters
-    ----------
-    residuals
-        ``(n_times, n_slopes)``.
-    present
-        ``(n_times,)``; rows where it is false are ignored.
-    order
-        Number of past frames.
+    ``residuals``: ``(n_times, n_slopes)``; ``present``: ``(n_times,)``; rows where it is false are ignored.
 
-    Returns
-    -------
-    ndarray, ``(order + 1,)``
-        ``[1, -a_1, ..., -a_order]``.
+    Returns ``[1, -a_1, ..., -a_order]``.
     """
     if order == 0:
         return np.ones(1)
@@ -60,6 +50,8 @@ def apply_filter(
 ) -> NDArray[np.float32]:
     """Filter rows in single precision: ``sum_k weights[k] values[at - k]``.
 
+    Returns ``(at.size, n - column)``.
+
     Parameters
     ----------
     values
@@ -68,12 +60,6 @@ def apply_filter(
         Filter, latest row first.
     at
         Indices of the rows to return, increasing. All rows between the first and the last are computed.
-    column
-        First column to return.
-
-    Returns
-    -------
-    ndarray, ``(at.size, n - column)``
     """
     source = np.ascontiguousarray(values, dtype=np.float32)
     if not at.size:
@@ -95,11 +81,6 @@ def fit_history_filters(
     Each is scaled so that its residuals have the variance of those of the longest filter, which gives rows
     with a short past their proper weight. Together they whiten a stretch of any length including its first
     frames, like the Cholesky factor of its covariance over time.
-
-    Parameters
-    ----------
-    residuals, present, order
-        As for :func:`fit_prediction_error_filter`.
     """
     filters, residual_rms = [], []
     history = count_known_history(present, order)

@@ -15,6 +15,7 @@ from escape_hw.api.procedure import Procedure, Reporter
 from escape_hw.api.results import CalibrationResult
 from escape_hw.api.sensor import SensorGeometry
 from escape_hw.bench import Bench
+from escape_hw.calibration.acquisition.aligned_telemetry import TelemetryBuffer
 from escape_hw.calibration.acquisition.frames import (
     build_interaction_matrix,
     validate_frame_count,
@@ -22,7 +23,6 @@ from escape_hw.calibration.acquisition.frames import (
 from escape_hw.calibration.acquisition.pokes import compute_random_amplitudes, select_random_pokes
 from escape_hw.calibration.acquisition.sensor_setup import SETUP_FRAMES
 from escape_hw.calibration.acquisition.slope_statistics import SlopeStatistics
-from escape_hw.calibration.acquisition.telemetry import AlignedTelemetry, TelemetryBuffer
 from escape_hw.calibration.docrime.acquisition import AcquisitionRecord, OpenLoopAcquisition
 from escape_hw.calibration.loop.control import build_integrator
 from escape_hw.calibration.loop.divergence import require_not_diverged
@@ -50,21 +50,10 @@ def calibrate_short_run(
 ) -> Procedure[CalibrationResult]:
     """Fit the registration to the telemetry of a few frames in open loop, and synthesise the matrix.
 
-    Parameters
-    ----------
-    bench
-        An open bench, loop open.
-    frames
-        Number of frames; the geometry of the sensor is found on them as well, unless ``grid`` is given.
-    poke
-        Pokes are uniform in +-poke on every mode, rms surface as fraction of full stroke.
-    grid
-        Geometry of the sensor, if it is known.
+    ``frames``: number of frames; the geometry of the sensor is found on them as well, unless ``grid`` is
+    given; ``poke``: pokes are uniform in +-poke on every mode, rms surface as fraction of full stroke.
 
-    Returns
-    -------
-    CalibrationResult
-        Without a measured matrix.
+    The result has no measured matrix.
 
     Raises
     ------
@@ -84,16 +73,15 @@ def calibrate_short_run(
         raise Aborted(
             f"aborted after {acquisition.n_received} of {frames} frames, too few for a registration"
         )
-    acquisition.process_pending()
-    record = acquisition.record()
-    if record is None or acquisition.grid is None or acquisition.slope_statistics is None:
+    sensor, record = acquisition.sensor, acquisition.record()
+    if record is None:
         raise RuntimeError("no frame was taken")
     # The lattice of a Shack-Hartmann was fitted to the mean spots of these frames; the pupil images of a
     # pyramid are located best on all frames.
     geometry = (
         acquisition.build_final_geometry()
         if acquisition.uses_run_mean
-        else acquisition.slope_statistics.annotate_geometry(acquisition.grid)
+        else sensor.statistics.annotate_geometry(sensor.grid)
     )
     shape = (geometry.n_slopes, m2c.shape[1])
     template = build_interaction_matrix(bench, geometry, m2c, np.zeros(shape), np.zeros(shape), "telemetry")
@@ -106,7 +94,7 @@ def calibrate_short_run(
     return replace(
         result,
         grid=acquisition.build_final_geometry(),
-        mean_frame=acquisition.mean_frame,
+        mean_frame=sensor.mean_frame,
         notes=(*result.notes, *acquisition.notes()),
     )
 
@@ -116,14 +104,8 @@ def fit_recorded_frames(
 ) -> Procedure[TelemetryFit]:
     """Fit the registration to the frames of an open-loop run.
 
-    Parameters
-    ----------
-    record
-        Frame indices, slopes and pokes.
-    template, grid
-        A matrix of this sensor and basis, whose data are not used, and the geometry of the model.
-    order
-        Order of the whitening filter.
+    ``template``, ``grid``: a matrix of this sensor and basis, whose data are not used, and the geometry of
+    the model.
     """
     c = bench.config.calibration
     data = telemetry_from_frames(*record, before=2 * c.whiten_order + c.lags)
@@ -157,7 +139,7 @@ def _build_result(
     synthetic = synthesise_calibration(bench, grid, fit.estimate, m2c)
     metrics = {
         **synthetic.matrix.metrics, "frames": frames, "lost_frames": lost, "poke": poke,
-        "shortened": shortened, "delay_frames": fit.response.delay, "whitening_order": order,
+        "clipped_pokes": shortened, "delay_frames": fit.response.delay_frames, "whitening_order": order,
     }  # fmt: skip
     return replace(
         synthetic,
@@ -177,12 +159,8 @@ def calibrate_short_run_closed_loop(
 
     Parameters and result as for :func:`calibrate_short_run`, except:
 
-    Parameters
-    ----------
-    closed_loop
-        Calibration whose matrix closes the loop, on whose grid the result is.
-    frames
-        Number of frames with pokes, without those in which the loop settles.
+    ``closed_loop``: calibration whose matrix closes the loop, on whose grid the result is; ``frames``: number
+    of frames with pokes, without those in which the loop settles.
 
     Raises
     ------
@@ -202,7 +180,10 @@ def calibrate_short_run_closed_loop(
     slope_statistics = SlopeStatistics(closed_loop.grid.n_slopes)
     yield from _record_frames(loop, frames, poke, past, buffer, slope_statistics)
     geometry = slope_statistics.annotate_geometry(closed_loop.grid, closed=True)
-    data = _take_telemetry(buffer, c.whiten_order + c.lags)
+    data, _ = buffer.take_block()
+    # Slopes without known commands of all lags and filters count as lost.
+    unknown = slice(c.whiten_order + c.lags)
+    data.present[unknown], data.slopes[unknown] = False, 0
     registration = closed_loop.registration
     fit = yield from fit_telemetry(
         data, closed_loop.matrix, bench.model(geometry), order=order, lags=c.lags,
@@ -243,11 +224,3 @@ def _record_frames(
                 f"aborted after {loop.record.frames} of {n_frames} frames, too few for a registration"
             ) from None
     require_not_diverged(loop.record.diverged, loop.record.frames)
-
-
-def _take_telemetry(buffer: TelemetryBuffer, n_unknown: int) -> AlignedTelemetry:
-    """The recorded telemetry; slopes without known commands of all lags and filters count as lost."""
-    data, _ = buffer.take_block()
-    data.present[:n_unknown] = False
-    data.slopes[:n_unknown] = 0
-    return data

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import threading
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,15 @@ from escape_hw.pipeline.control.integrator import LeakyIntegrator
 from escape_hw.pipeline.control.reconstructor import reconstructor
 
 
+def invert_matrix(matrix: InteractionMatrix, dropped_modes: int) -> NDArray[np.float32]:
+    """Reconstructor ``(n_modes, n_slopes)`` of a matrix without its weakest eigenmodes per stroke.
+
+    Raises :class:`CalibrationError` if the matrix cannot be inverted.
+    """
+    stroke = np.sqrt(np.mean(np.square(matrix.m2c), axis=0))
+    return reconstructor(matrix.data, scale=stroke, dropped_modes=dropped_modes)
+
+
 def build_integrator(
     bench: Bench,
     matrix: InteractionMatrix,
@@ -30,14 +40,7 @@ def build_integrator(
 ) -> LeakyIntegrator:
     """Build the leaky integrator that closes the loop with a matrix; nothing moves.
 
-    Parameters
-    ----------
-    bench
-        Bench whose configuration gives the default loop parameters.
-    matrix, grid
-        Interaction matrix, and the sensor geometry that it was measured on.
-    gain, leak, dropped_modes
-        Loop parameters; by default as configured.
+    ``gain``, ``leak``, ``dropped_modes``: loop parameters; by default as configured.
 
     Raises
     ------
@@ -60,9 +63,8 @@ def build_integrator(
         )
     if not np.array_equal(matrix.valid, grid.valid):
         raise IncompatibleProduct(f"the matrix and the geometry mark different {grid.elements} as valid")
-    stroke = np.sqrt(np.mean(np.square(matrix.m2c), axis=0))
     dropped = c.dropped_modes if dropped_modes is None else dropped_modes
-    return LeakyIntegrator(reconstructor(matrix.data, scale=stroke, dropped_modes=dropped), gain, leak)
+    return LeakyIntegrator(invert_matrix(matrix, dropped), gain, leak)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,19 +76,17 @@ class LoopSettings:
     leak: float
     dropped_modes: int
 
+    def with_changes(self, **changes: Any) -> LoopSettings:
+        """The settings with changes; those that are ``None`` do not count."""
+        return replace(self, **{name: value for name, value in changes.items() if value is not None})
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoopChange:
     """New settings, ready to be applied between two frames.
 
-    Parameters
-    ----------
-    settings
-        The settings.
-    control, slopes_of
-        Controller, and slope function with the references of the calibration.
-    undriven
-        Combinations of modes that the controller does not drive ``(n_modes, n)``, orthonormal.
+    ``control``, ``slopes_of``: controller, and slope function with the references of the calibration;
+    ``undriven``: combinations of modes that the controller does not drive ``(n_modes, n)``, orthonormal.
     """
 
     settings: LoopSettings
@@ -99,13 +99,6 @@ class LoopControl:
     """Requests to a running loop, from any thread; the loop applies them between two frames.
 
     The requesting thread does all slow work, such as the inversion of a matrix.
-
-    Parameters
-    ----------
-    bench, calibration
-        Bench, and the calibration whose matrix closes the loop.
-    gain, leak, dropped_modes
-        Loop parameters; by default as configured.
 
     Raises
     ------
@@ -125,12 +118,8 @@ class LoopControl:
         c = bench.config.loop
         self._bench, self._lock = bench, threading.Lock()
         self._open_requested = False
-        self._requested = LoopSettings(
-            calibration,
-            c.gain if gain is None else gain,
-            c.leak if leak is None else leak,
-            c.dropped_modes if dropped_modes is None else dropped_modes,
-        )
+        configured = LoopSettings(calibration, c.gain, c.leak, c.dropped_modes)
+        self._requested = configured.with_changes(gain=gain, leak=leak, dropped_modes=dropped_modes)
         self._pending: LoopChange | None = self._prepare(self._requested)
 
     @property
@@ -163,11 +152,8 @@ class LoopControl:
         """
         with self._lock:
             now = self._requested
-            requested = LoopSettings(
-                now.calibration if calibration is None else calibration,
-                now.gain if gain is None else gain,
-                now.leak if leak is None else leak,
-                now.dropped_modes if dropped_modes is None else dropped_modes,
+            requested = now.with_changes(
+                calibration=calibration, gain=gain, leak=leak, dropped_modes=dropped_modes
             )
             _require_exchangeable(now.calibration, requested.calibration)
             self._pending = self._prepare(requested)

@@ -6,13 +6,11 @@ import math
 from array import array
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from escape_hw.config.system import SystemConfig
+from escape_hw.config.system import ServerSection
 from escape_hw.errors import CalibrationError
 
 #: Frames of the running means of the squared residual: the present one and the usual one.
@@ -22,72 +20,36 @@ _MAX_USUAL_BLOCKS, _MIN_USUAL_BLOCKS = 30, 3
 #: Ratio of the last third's residual to the middle third's at which a run was not steady, and the fewest
 #: residuals of a third.
 _MAX_GROWTH_BETWEEN_THIRDS, _MIN_THIRD = 2.0, 20
-
-
-@dataclass(frozen=True, slots=True)
-class DivergenceLimits:
-    """Limits of all divergence rules.
-
-    Parameters
-    ----------
-    residual_factor
-        Ratio of the residual's rms to its usual value above which the residual diverges.
-    residual_s
-        Seconds of a diverging residual after which the loop is opened.
-    saturated_fraction
-        Share of the actuators beyond their limits above which a frame counts as saturated.
-    saturated_frames
-        Consecutive saturated frames after which the loop is opened.
-    limited_residual_factor
-        As ``residual_factor``, for a loop with pokes while the limits shorten its commands.
-    limited_fraction
-        Share of shortened commands at which ``limited_residual_factor`` applies.
-    """
-
-    residual_factor: float = 4.0
-    residual_s: float = 1.0
-    saturated_fraction: float = 0.2
-    saturated_frames: int = 50
-    limited_residual_factor: float = 2.0
-    limited_fraction: float = 0.9
-
-    @classmethod
-    def from_config(cls, config: SystemConfig) -> Self:
-        """Limits of ``[server]``: ``diverging_factor``, ``diverging_s``, ``saturated_fraction``."""
-        server = config.server
-        return cls(server.diverging_factor, server.diverging_s, server.saturated_fraction)
+#: Consecutive saturated frames after which the loop is opened.
+_MAX_SATURATED_FRAMES = 50
+#: Ratio of the residual to its usual value at which a loop with pokes diverges while the limits shorten more
+#: than this fraction of its commands.
+_LIMITED_FACTOR, _LIMITED_FRACTION = 2.0, 0.9
 
 
 class SaturationMonitor:
-    """Detects a mirror that is held at its limits, frame by frame."""
+    """Detects a mirror that is held at its limits (``server.saturated_fraction``), frame by frame."""
 
-    def __init__(self, limits: DivergenceLimits, n_act: int) -> None:
-        self._max_clipped, self._max_frames = limits.saturated_fraction * n_act, limits.saturated_frames
-        self._n_frames = 0
+    def __init__(self, settings: ServerSection, n_act: int) -> None:
+        self._max_clipped, self._n_frames = settings.saturated_fraction * n_act, 0
 
     def __call__(self, n_clipped: int) -> bool:
         """Whether the loop diverges, given the number of actuators beyond the stroke in this frame."""
         self._n_frames = self._n_frames + 1 if n_clipped > self._max_clipped else 0
-        return self._n_frames >= self._max_frames
+        return self._n_frames >= _MAX_SATURATED_FRAMES
 
 
 class ResidualMonitor:
     """Detects a growing residual, frame by frame, before the mirror reaches its limits.
 
-    The residual diverges while its rms over the last 50 frames exceeds ``residual_factor`` times the usual
-    rms and also the largest residual of the first 50 frames. A loop that still converges therefore stays
-    closed. The usual rms is a running mean over 2000 frames, which diverging frames do not enter.
-
-    Parameters
-    ----------
-    limits
-        Factor and time.
-    rate_hz
-        Frames per second.
+    The residual diverges while its rms over the last 50 frames exceeds ``server.diverging_factor`` times the
+    usual rms and also the largest residual of the first 50 frames. A loop that still converges therefore
+    stays closed. The usual rms is a running mean over 2000 frames, which diverging frames do not enter.
     """
 
-    def __init__(self, limits: DivergenceLimits, rate_hz: float) -> None:
-        self._factor, self._max_frames = limits.residual_factor, max(1, round(limits.residual_s * rate_hz))
+    def __init__(self, settings: ServerSection, rate_hz: float) -> None:
+        self._factor = settings.diverging_factor
+        self._max_frames = max(1, round(settings.diverging_s * rate_hz))
         self._present = self._usual = self._initial_max = math.nan
         self._n_residuals = self._n_diverging = 0
 
@@ -102,7 +64,8 @@ class ResidualMonitor:
             if n <= _PRESENT_FRAMES:
                 self._initial_max = max(self._initial_max, square)
             self._present += (square - self._present) / min(n, _PRESENT_FRAMES)
-            if n > 2 * _PRESENT_FRAMES and self._present > self._limit():
+            limit = max(self._factor**2 * self._usual, self._initial_max)
+            if n > 2 * _PRESENT_FRAMES and self._present > limit:
                 self._n_diverging += 1
             else:
                 self._n_diverging = 0
@@ -115,9 +78,6 @@ class ResidualMonitor:
         """Present rms divided by the usual rms."""
         return math.sqrt(self._present / self._usual) if self._usual > 0 else math.nan
 
-    def _limit(self) -> float:
-        return max(self._factor**2 * self._usual, self._initial_max)
-
 
 class BlockResidualMonitor:
     """Detects a growing residual in blocks of frames of a loop with pokes.
@@ -127,24 +87,20 @@ class BlockResidualMonitor:
     slopes saturate before the mirror does.
     """
 
-    def __init__(self, limits: DivergenceLimits) -> None:
-        self._limits = limits
+    def __init__(self, settings: ServerSection) -> None:
+        self._factor = settings.diverging_factor
         self._residual: deque[float] = deque(maxlen=_MAX_USUAL_BLOCKS)
 
     def __call__(self, residual: Sequence[float], n_shortened: int) -> bool:
         """Whether the loop diverged in its last block.
 
-        Parameters
-        ----------
-        residual
-            Residual of each frame of the block, in nm.
-        n_shortened
-            Number of commands in the block that the limits shortened.
+        ``residual``: residual of each frame of the block, in nm; ``n_shortened``: number of commands in the
+        block that the limits shortened.
         """
         rms = float(np.sqrt(np.mean(np.square(residual))))
         usual = float(np.median(self._residual)) if len(self._residual) >= _MIN_USUAL_BLOCKS else np.inf
-        is_limited = n_shortened > self._limits.limited_fraction * len(residual)
-        factor = self._limits.limited_residual_factor if is_limited else self._limits.residual_factor
+        is_limited = n_shortened > _LIMITED_FRACTION * len(residual)
+        factor = _LIMITED_FACTOR if is_limited else self._factor
         if rms > factor * usual:
             return True
         self._residual.append(rms)

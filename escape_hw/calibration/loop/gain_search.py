@@ -37,12 +37,8 @@ _NOMINAL_ERROR = 0.1
 class GainSearch:
     """Result of a search for the best gain; unpacks as ``gain, runs``.
 
-    Parameters
-    ----------
-    gain, sigma
-        The best gain and its standard error, NaN if the search was stopped.
-    runs
-        One run per gain tried.
+    ``gain``, ``sigma``: the best gain and its standard error, NaN if the search was stopped; ``runs``: one
+    run per gain tried.
     """
 
     gain: float
@@ -66,8 +62,6 @@ def find_best_gain(
 
     Parameters
     ----------
-    bench
-        An open bench.
     matrix, grid
         Interaction matrix, and the sensor geometry that it was measured on.
     gains

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import math
 import time
-from array import array
 from collections.abc import Mapping
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager
@@ -19,11 +18,11 @@ from escape_hw.api.results import Estimate
 from escape_hw.bench import Bench
 from escape_hw.calibration.acquisition.sensor_setup import prepare_sensor
 from escape_hw.calibration.loop.control import LoopChange, LoopControl, LoopSettings
-from escape_hw.calibration.loop.divergence import DivergenceLimits, ResidualMonitor
+from escape_hw.calibration.loop.divergence import ResidualMonitor
+from escape_hw.calibration.loop.performance import peak_strehl
 from escape_hw.calibration.loop.runner import RunningLoop
 from escape_hw.errors import Aborted, CalibrationError, CommandRejected, FrameTimeout
 from escape_hw.pipeline.psf.frame_stack import FrameStack
-from escape_hw.pipeline.psf.strehl import strehl
 from escape_hw.pipeline.statistics import MIN_SAMPLES
 from escape_hw.streams.realtime import PRIORITY, isolated_cpus, realtime_thread
 from escape_hw.streams.timing import TimingSummary
@@ -45,10 +44,7 @@ _N_RESIDUALS = 500
 class RunningStrehl:
     """Strehl ratio of the science frames since the last evaluation, computed in another thread.
 
-    Parameters
-    ----------
-    model
-        PSF without turbulence ``(rows, columns)``.
+    ``model``: PSF without turbulence ``(rows, columns)``.
     """
 
     def __init__(self, model: NDArray[np.float32]) -> None:
@@ -64,35 +60,19 @@ class RunningStrehl:
             self._value, self._pending = self._pending.result() or self._value, None
         if images.count < MIN_SAMPLES:
             return False
-        self._pending = pool.submit(self._evaluate, images)
+        self._pending = pool.submit(peak_strehl, images, self._model)
         return True
 
     def metrics(self) -> dict[str, float]:
         """Latest Strehl ratio of the peak, and its standard error; NaN before the first."""
         return {"strehl": self._value.value, "strehl_sigma": self._value.sigma}
 
-    def _evaluate(self, images: FrameStack) -> Estimate | None:
-        try:
-            return strehl(images.images(), self._model).peak
-        except CalibrationError as error:
-            log.warning("no Strehl ratio: %s", error)
-            return None
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoopSummary:
     """Summary of a loop that ran until it was opened.
 
-    Parameters
-    ----------
-    fault
-        Why the loop was opened without a request; empty after a request.
-    settings
-        Last settings in force.
-    frames, lost_frames, timeouts
-        Frames processed, frames lost by the camera, and time-outs of the camera.
-    timing
-        Latency and jitter since the loop was closed.
+    ``fault``: why the loop was opened without a request; empty after a request.
     """
 
     fault: str
@@ -119,10 +99,6 @@ def run_until_opened(
 
     Parameters
     ----------
-    bench
-        An open bench.
-    loop_control
-        Initial matrix and settings, and later requests.
     model_psf
         PSF without turbulence. With it and a science camera the Strehl ratio is measured.
 
@@ -165,7 +141,7 @@ class _ContinuousLoop:
         )  # fmt: skip
         rate_hz = bench.wfs.settings.frame_rate_hz
         self.control = first.control
-        self.residual_monitor = ResidualMonitor(DivergenceLimits.from_config(bench.config), rate_hz)
+        self.residual_monitor = ResidualMonitor(bench.config.server, rate_hz)
         self.frames_per_check = max(1, round(_CHECK_PERIOD_S * rate_hz))
         self.fade_frames_left = 0
         self.fade_step = np.zeros(len(first.undriven))
@@ -225,16 +201,13 @@ class _ContinuousLoop:
                 "the actuators stayed at their limits: lower the gain or drop more modes; if that does not "
                 "help, measure the matrix again"
             )
-        if self.residual_monitor(self._residuals_since(before)):
+        residual = loop.record.residual
+        if self.residual_monitor(residual[len(residual) - (loop.record.frames - before) :]):
             return (
                 f"the residual grew {self.residual_monitor.growth:.2g}-fold: lower the gain, drop more "
                 "modes, or measure the matrix again"
             )
         return ""
-
-    def _residuals_since(self, frames: int) -> array[float]:
-        residual = self.loop.record.residual
-        return residual[len(residual) - (self.loop.record.frames - frames) :]
 
     def _handle_requests(self, pool: ThreadPoolExecutor) -> None:
         """Apply requests and start evaluations, in less than the time of a frame."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Sequence
 
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from escape_hw.api.camera import Camera
 from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.procedure import Procedure, Reporter
-from escape_hw.api.results import LoopResult, StrehlEstimate
+from escape_hw.api.results import Estimate, LoopResult, StrehlEstimate
 from escape_hw.api.sensor import SensorGeometry
 from escape_hw.bench import Bench
 from escape_hw.calibration.acquisition.frames import validate_frame_count
@@ -19,8 +20,11 @@ from escape_hw.calibration.loop.control import build_integrator
 from escape_hw.calibration.loop.divergence import is_steady
 from escape_hw.calibration.loop.runner import SETTLING_S, LoopRecord, RunningLoop, minimum_strehl_frames
 from escape_hw.errors import Aborted, CalibrationError
+from escape_hw.pipeline.psf.frame_stack import FrameStack
 from escape_hw.pipeline.psf.strehl import strehl, subtract_background
 from escape_hw.pipeline.statistics import MIN_SAMPLES
+
+log = logging.getLogger(__name__)
 
 
 def close_loop(
@@ -39,8 +43,6 @@ def close_loop(
 
     Parameters
     ----------
-    bench
-        An open bench.
     matrix, grid
         Interaction matrix, and the sensor geometry that it was measured on.
     gain, leak, dropped_modes
@@ -109,6 +111,15 @@ def _evaluate_images(
         return images, strehl(images, model_psf), notes
     except CalibrationError as error:
         return images, None, [*notes, f"no Strehl ratio: {error}"]
+
+
+def peak_strehl(images: FrameStack, model_psf: NDArray[np.float32]) -> Estimate | None:
+    """Strehl ratio of the peak; ``None``, with a line in the log, if the images are dark or not centred."""
+    try:
+        return strehl(images.images(), model_psf).peak
+    except CalibrationError as error:
+        log.warning("no Strehl ratio: %s", error)
+        return None
 
 
 def _collect_science_notes(bench: Bench, science: Camera, record: LoopRecord, seconds: float) -> list[str]:

@@ -21,8 +21,8 @@ from escape_hw.api.sensor import SensorGeometry, SlopeFunction
 from escape_hw.bench import Bench
 from escape_hw.calibration.acquisition.frames import FluxMonitor, limit_to_reachable, next_frame
 from escape_hw.calibration.acquisition.sensor_setup import build_slope_function, prepare_sensor
-from escape_hw.calibration.loop.divergence import DivergenceLimits, SaturationMonitor
-from escape_hw.pipeline.control.integrator import Controller
+from escape_hw.calibration.loop.divergence import SaturationMonitor
+from escape_hw.pipeline.control.integrator import LeakyIntegrator
 from escape_hw.pipeline.control.matrix_products import build_command_mapper
 from escape_hw.pipeline.psf.frame_stack import FrameStack
 from escape_hw.pipeline.psf.strehl import is_peak_saturated
@@ -44,13 +44,7 @@ LoopObserver = Callable[[int, NDArray[np.float32], NDArray[np.float64], NDArray[
 
 
 def minimum_strehl_frames(loop_hz: float, science_hz: float) -> int:
-    """Fewest frames of a loop after which its Strehl ratios have standard errors.
-
-    Parameters
-    ----------
-    loop_hz, science_hz
-        Frame rates of the wavefront sensor and of the science camera.
-    """
+    """Fewest frames of a loop after which its Strehl ratios have standard errors."""
     return math.ceil((SETTLING_S + (MIN_SAMPLES + 2) / science_hz) * loop_hz)
 
 
@@ -66,8 +60,6 @@ class LoopRecord:
         Rms of the reconstructed wavefront by frame, in nm.
     latency
         Time from the arrival of a frame to its command by frame, in ns.
-    frames
-        Number of frames processed.
     shortened
         Number of commands that the mirror's limits changed.
     diverged
@@ -92,27 +84,12 @@ class RunningLoop:
     Use it as ``with loop.closed(): yield from loop.run(frames)``. Between two frames the controller may get
     another reconstructor or another gain.
 
-    Parameters
-    ----------
-    bench
-        An open bench, its sensor prepared.
-    m2c
-        Mode-to-command matrix ``(n_act, n_modes)``.
-    slopes_of
-        Slope function.
-    control
-        Modal controller.
-    science
-        Whether to collect frames of the science camera.
+    ``bench``: an open bench, its sensor prepared; ``m2c``: mode-to-command matrix ``(n_act, n_modes)``.
 
     Attributes
     ----------
     record
         Measurements of all stretches, also of an aborted one.
-    timing
-        Latencies and frame intervals since construction.
-    settling_frames
-        Number of frames in :data:`SETTLING_S`.
     closed_at_ns
         Time at which the loop was closed, by the clock of the sensor's camera.
     """
@@ -122,7 +99,7 @@ class RunningLoop:
         bench: Bench,
         m2c: NDArray[np.float64],
         slopes_of: SlopeFunction,
-        control: Controller,
+        control: LeakyIntegrator,
         *,
         science: bool = False,
     ) -> None:
@@ -133,7 +110,7 @@ class RunningLoop:
         self.closed_at_ns = self._lost_before = 0
         self._to_actuators, self._to_modes = build_command_mapper(m2c), np.linalg.pinv(m2c)
         self._flux_monitor = FluxMonitor(bench.wfs.name, slopes_of.grid)
-        self._is_saturated = SaturationMonitor(DivergenceLimits.from_config(bench.config), len(m2c))
+        self._is_saturated = SaturationMonitor(bench.config.server, len(m2c))
         self._science = bench.science if science else None
         # Reflection doubles the surface; modes have unit rms surface.
         self._nm_per_unit = 2e9 * bench.dm.info.stroke_m
@@ -149,7 +126,7 @@ class RunningLoop:
         bench: Bench,
         matrix: InteractionMatrix,
         grid: SensorGeometry,
-        control: Controller,
+        control: LeakyIntegrator,
         *,
         science: bool = False,
     ) -> Self:
@@ -218,14 +195,10 @@ class RunningLoop:
 
         Parameters
         ----------
-        frames
-            Number of frames.
         inject
             Source of pokes. Pokes are added to the controller's command and do not enter its state. With
             pokes, a command beyond the limits is shortened as a whole instead of actuator by actuator, so
             that it remains a known combination of the modes.
-        observe
-            Called after the command of each frame was sent.
         report
             Progress reporter; a stage of its own by default.
 

@@ -61,12 +61,7 @@ def von_karman_covariance(distance_m: NDArray[np.float64], outer_scale_m: float)
     ``x^(5/6) K_5/6(x) 2^(1/6) / Gamma(5/6)`` with ``x = 2 pi r / L0``: the Fourier transform of the
     power spectrum ``(f^2 + 1 / L0^2)^(-11/6)`` (Conan 2000).
 
-    Parameters
-    ----------
-    distance_m
-        Distances of any shape in metres.
-    outer_scale_m
-        Outer scale in metres.
+    ``distance_m``: distances of any shape in metres; ``outer_scale_m``: outer scale in metres.
     """
     x = 2 * np.pi * np.maximum(distance_m, 1e-9 * outer_scale_m) / outer_scale_m
     return np.asarray(x ** (5 / 6) * special.kv(5 / 6, x) * (2 ** (1 / 6) / special.gamma(5 / 6)))
@@ -84,6 +79,8 @@ def karhunen_loeve(
     Double diagonalisation (Gendron 1995): modes that are orthonormal over the pupil without piston, with
     uncorrelated coefficients of the turbulence, ordered by decreasing variance.
 
+    Returns ``(n_act, n_modes)``, columns with unit rms surface over the pupil, signs fixed.
+
     Parameters
     ----------
     surfaces
@@ -96,11 +93,6 @@ def karhunen_loeve(
         Number of modes, at most ``n_act - 1``.
     outer_scale_m
         Outer scale of the turbulence in metres.
-
-    Returns
-    -------
-    ndarray, ``(n_act, n_modes)``
-        Columns with unit rms surface over the pupil, signs fixed.
 
     Raises
     ------
@@ -173,14 +165,7 @@ def zonal(surfaces: NDArray[np.float64], pupil: NDArray[np.bool_], n_modes: int)
 def zernike(surfaces: NDArray[np.float64], pupil: NDArray[np.bool_], n_modes: int) -> NDArray[np.float64]:
     """Zernike modes without piston, in Noll's order ``(n_act, n_modes)`` (Noll 1976).
 
-    Parameters
-    ----------
-    surfaces
-        Influence functions ``(n_act, n, n)``.
-    pupil
-        Boolean ``(n, n)``.
-    n_modes
-        Number of modes.
+    ``surfaces``: influence functions ``(n_act, n, n)``; ``pupil``: Boolean ``(n, n)``.
 
     Raises
     ------
@@ -190,7 +175,7 @@ def zernike(surfaces: NDArray[np.float64], pupil: NDArray[np.bool_], n_modes: in
     x, y = _unit_coordinates(pupil)
     r, angle = np.hypot(x, y), np.arctan2(y, x)
     shapes = [
-        _radial_polynomial(n, abs(m), r) * _azimuthal_factor(m, angle)
+        _radial_polynomial(n, abs(m), r) * (np.cos(m * angle) if m >= 0 else np.sin(-m * angle))
         for n, m in islice(_noll_orders(), n_modes)
     ]
     return _fit_shapes(surfaces, pupil, np.array(shapes), "Zernike")
@@ -198,11 +183,6 @@ def zernike(surfaces: NDArray[np.float64], pupil: NDArray[np.bool_], n_modes: in
 
 def fourier(surfaces: NDArray[np.float64], pupil: NDArray[np.bool_], n_modes: int) -> NDArray[np.float64]:
     """Tip, tilt, then cosines and sines of whole cycles across the pupil's diameter, lowest frequency first.
-
-    Parameters
-    ----------
-    surfaces, pupil, n_modes
-        As for :func:`zernike`.
 
     Raises
     ------
@@ -245,10 +225,6 @@ def _radial_polynomial(n: int, m: int, r: NDArray[np.float64]) -> NDArray[np.flo
         denominator = factorial(k) * factorial((n + m) // 2 - k) * factorial((n - m) // 2 - k)
         total += (-1) ** k * factorial(n - k) / denominator * r ** (n - 2 * k)
     return total
-
-
-def _azimuthal_factor(m: int, angle: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.asarray(np.cos(m * angle) if m >= 0 else np.sin(-m * angle))
 
 
 def _fourier_frequencies() -> Iterator[tuple[int, int]]:
@@ -310,8 +286,6 @@ def build_basis(
 
     Parameters
     ----------
-    config
-        Configuration with the section ``basis``.
     surfaces, pupil, pixel_m
         Influence functions ``(n_act, n, n)`` in fractions of full stroke, the pupil ``(n, n)`` and the size
         of a pixel in metres.

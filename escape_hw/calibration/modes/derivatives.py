@@ -24,16 +24,8 @@ def modal_matrix(
 ) -> NDArray[np.float64]:
     """Slopes per unit of each mode ``(n_slopes, n_modes)``.
 
-    Parameters
-    ----------
-    model
-        Any synthetic model.
-    registration
-        Registration of the mirror.
-    m2c
-        Mode-to-command matrix ``(n_act, n_modes)``.
-    width
-        Scale of the influence functions' width relative to nominal.
+    ``m2c``: mode-to-command matrix ``(n_act, n_modes)``; ``width``: scale of the influence functions' width
+    relative to nominal.
     """
     if isinstance(model, DifferentiableModel):
         return model.modal_matrix(registration, m2c, width)
@@ -44,11 +36,6 @@ def modal_jacobian(
     model: SyntheticModel, registration: Registration, m2c: NDArray[np.float64], width: float = 1.0
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Slopes per unit of each mode, and their derivatives.
-
-    Parameters
-    ----------
-    model, registration, m2c, width
-        As for :func:`modal_matrix`.
 
     Returns
     -------
@@ -64,13 +51,7 @@ def modal_jacobian(
 def zonal_jacobian(
     model: SyntheticModel, registration: Registration, width: float = 1.0
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Slopes per unit command ``(n_slopes, n_act)`` and their derivatives ``(6, n_slopes, n_act)``.
-
-    Parameters
-    ----------
-    model, registration, width
-        As for :func:`modal_matrix`.
-    """
+    """Slopes per unit command ``(n_slopes, n_act)`` and their derivatives ``(6, n_slopes, n_act)``."""
     if isinstance(model, DifferentiableModel):
         return model.zonal_jacobian(registration, width)
     return _central_differences(model.zonal_matrix, registration, width)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.optical_gains import ClosureStep, GainRound, GainsResult, OpticalGains
 from escape_hw.api.procedure import Procedure, Progress
-from escape_hw.api.results import CalibrationResult, StrehlEstimate
+from escape_hw.api.results import CalibrationResult
 from escape_hw.bench import Bench
 from escape_hw.calibration.acquisition.pokes import (
     compute_poke_amplitudes,
@@ -63,14 +63,14 @@ class GainsRun:
         return f"<{type(self).__name__} {self.result!r}\n  rescaled: {self.rescaled_calibration.matrix!r}>"
 
 
-@renamed_keywords(beside="comparisons", shape="closed_loop_matrix")
+@renamed_keywords(beside="comparisons", shape="closed_loop_matrix", budget="allowed_strehl_loss")
 def bootstrap_gains(
     bench: Bench,
     calibration: CalibrationResult,
     *,
     poke: float = 0.002,
     accuracy: float = 0.01,
-    budget: float = 0.01,
+    allowed_strehl_loss: float = 0.01,
     frames: int = 20000,
     gain: float | None = None,
     comparisons: Mapping[str, InteractionMatrix] | None = None,
@@ -90,7 +90,7 @@ def bootstrap_gains(
         0.002).
     accuracy
         Relative standard error of the gains at which a round ends, rms over the modes.
-    budget
+    allowed_strehl_loss
         Largest relative loss of Strehl ratio due to the last pokes, which are reduced to it.
     frames
         Largest number of frames per round.
@@ -120,182 +120,208 @@ def bootstrap_gains(
         The loop does not close, or does not stay closed.
     """
     target_gain = bench.config.loop.gain if gain is None else gain
-    _require_fractions(poke=poke, accuracy=accuracy, budget=budget, gain=target_gain)
-    state, all_comparisons = _BootstrapState(), dict(comparisons or {})
+    numbers = {
+        "poke": poke, "accuracy": accuracy, "allowed_strehl_loss": allowed_strehl_loss, "gain": target_gain
+    }  # fmt: skip
+    for name, value in numbers.items():
+        if not 0 < value < 1:
+            raise ConfigError(f"{name} is {value}; it must lie between 0 and 1")
+    all_comparisons = dict(comparisons or {})
     if closed_loop_matrix is not None:
         all_comparisons[_CLOSED_LOOP_MATRIX] = closed_loop_matrix
     loop = GainMeasurementLoop(bench, calibration, all_comparisons, science=model_psf is not None)
+    bootstrap = _Bootstrap(loop, list(all_comparisons), target_gain, model_psf)
     with loop.closed():
         try:
-            yield from _close_and_scale_loop(loop, target_gain, poke, state)
-            target = _BootstrapTarget(poke, accuracy, budget, frames, model_psf)
-            yield from _run_rounds(loop, target, list(all_comparisons), state)
+            yield from bootstrap.close_and_scale_loop(poke)
+            yield from bootstrap.run_rounds(poke, accuracy, allowed_strehl_loss, frames)
         except Aborted:
-            state.partial = True
-            _save_partial_round(loop, state)
-    return _build_run(loop, calibration, closed_loop_matrix, state, loop.lost_frames)
+            bootstrap.save_partial_round()
+    return bootstrap.build_run(calibration, closed_loop_matrix)
 
 
-@dataclass(slots=True, eq=False)
-class _BootstrapState:
-    """Intermediate results of a bootstrap."""
+class _Bootstrap:
+    """State and steps of a bootstrap in a closed loop."""
 
-    applied: OpticalGains | None = None
-    steps: list[ClosureStep] = field(default_factory=list)
-    rounds: list[GainRound] = field(default_factory=list)
-    comparisons: dict[str, OpticalGains] = field(default_factory=dict)
-    notes: list[str] = field(default_factory=list)
-    gain: float = math.nan
-    amplitude: float = math.nan
-    retries: int = 0
-    converged: bool = False
-    partial: bool = False
+    def __init__(
+        self,
+        loop: GainMeasurementLoop,
+        comparison_names: list[str],
+        gain: float,
+        model_psf: NDArray[np.float32] | None,
+    ) -> None:
+        self._loop, self._comparison_names, self._gain, self._model_psf = (
+            loop,
+            comparison_names,
+            gain,
+            model_psf,
+        )
+        #: The gains by which the matrix in use is scaled.
+        self._applied: OpticalGains | None = None
+        self._steps: list[ClosureStep] = []
+        self._rounds: list[GainRound] = []
+        self._comparisons: dict[str, OpticalGains] = {}
+        self._notes: list[str] = []
+        self._largest_amplitude = math.nan
+        self._retries = 0
+        self._converged = self._partial = False
+        self._min_frames = max(_FRAMES_PER_MODE * loop.reference.n_modes, _MIN_FRAMES)
 
+    def close_and_scale_loop(self, poke: float) -> Procedure[None]:
+        """Close the loop at the effective gain, and scale its matrix by the measured gains."""
+        loop = self._loop
+        amplitude = compute_poke_amplitudes(loop.bench, loop.reference.m2c, max(poke, _FIRST_POKE))
+        closure = yield from bootstrap_loop(loop, self._gain, amplitude, self._min_frames, self._steps)
+        yield self._apply_gains(_smooth(closure.gains))
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _BootstrapTarget:
-    """Options of :func:`bootstrap_gains`."""
+    def run_rounds(
+        self, last_poke: float, last_accuracy: float, allowed_strehl_loss: float, max_frames: int
+    ) -> Procedure[None]:
+        """Measure and rescale with decreasing pokes until two rounds at the last poke agree.
 
-    poke: float
-    accuracy: float
-    budget: float
-    frames: int
-    model_psf: NDArray[np.float32] | None
+        Raises :class:`CalibrationError` if the loop does not stay closed.
+        """
+        loop, poke, repeats = self._loop, max(last_poke, _FIRST_POKE), 0
+        while repeats < _MAX_LAST_ROUNDS and not self._converged:
+            is_last_poke = poke <= last_poke
+            amplitude = compute_poke_amplitudes(loop.bench, loop.reference.m2c, poke)
+            if is_last_poke:
+                amplitude = scale_to_strehl_budget(amplitude, allowed_strehl_loss, *self._strehl_cost())
+            self._largest_amplitude = float(amplitude.max())
+            accuracy = last_accuracy * (1 if is_last_poke else _EARLY_ACCURACY_FACTOR)
+            segment = yield from loop.measure(
+                self._min_frames, amplitude,
+                f"round {len(self._rounds) + 1}, poke {amplitude.max():.2g}", max_frames=max_frames,
+                is_sufficient=partial(_is_accurate, target=accuracy),
+            )  # fmt: skip
+            if segment.diverged or segment.gains is None or self._residual_is_high(segment):
+                self._lower_gain(segment)
+                continue
+            last = self._record_round(segment, segment.gains, amplitude, accuracy)
+            yield self._apply_gains(last.gains)
+            is_confirmed = last.reached and last.change <= max(_TOLERANCE, 2 * last.expected_change)
+            self._converged = is_last_poke and is_confirmed
+            repeats += is_last_poke
+            poke = max(last_poke, poke * _POKE_FACTOR)
 
+    def _lower_gain(self, segment: LoopSegment) -> None:
+        """Open an unstable loop and reduce its gain; raises after :data:`_MAX_RETRIES` reductions."""
+        self._retries += 1
+        if self._retries > _MAX_RETRIES:
+            reason = "diverged" if segment.diverged else (segment.reason or "oscillates")
+            raise CalibrationError(
+                f"the loop does not stay closed: at an effective gain of {self._gain:.2f} it {reason}; "
+                "lower loop.gain, drop more modes, or measure the matrix again"
+            )
+        self._gain *= _GAIN_REDUCTION
+        self._notes.append(f"the loop was not stable; its gain was lowered to {self._gain:.3g}")
+        self._loop.open_loop()
+        self._loop.control.set_gain(self._gain)
 
-def _close_and_scale_loop(
-    loop: GainMeasurementLoop, target_gain: float, poke: float, state: _BootstrapState
-) -> Procedure[None]:
-    """Close the loop at an effective gain, and scale its matrix by the measured gains."""
-    matrix = loop.reference
-    amplitude = compute_poke_amplitudes(loop.bench, matrix.m2c, max(poke, _FIRST_POKE))
-    frames = max(_FRAMES_PER_MODE * matrix.n_modes, _MIN_FRAMES)
-    closure = yield from bootstrap_loop(loop, target_gain, amplitude, frames, state.steps)
-    state.gain = target_gain
-    _apply_gains(loop, state, _smooth(closure.gains))
-    yield _progress(state)
+    def _residual_is_high(self, segment: LoopSegment) -> bool:
+        """Whether the residual is far above those of the first closure.
 
+        The slopes of a pyramid saturate before the mirror does, so divergence is not detected by the limits.
+        """
+        known = [step.residual_nm for step in self._steps if step.stable and math.isfinite(step.residual_nm)]
+        return bool(known) and segment.residual_nm > 1.5 * max(known)
 
-def _run_rounds(
-    loop: GainMeasurementLoop, target: _BootstrapTarget, comparison_names: list[str], state: _BootstrapState
-) -> Procedure[None]:
-    """Measure and rescale with decreasing pokes until two rounds at the last poke agree.
-
-    Raises :class:`CalibrationError` if the loop does not stay closed.
-    """
-    poke_size, repeats = max(target.poke, _FIRST_POKE), 0
-    min_frames = max(_FRAMES_PER_MODE * loop.reference.n_modes, _MIN_FRAMES)
-    while repeats < _MAX_LAST_ROUNDS and not state.converged:
-        is_last_poke = poke_size <= target.poke
-        amplitude = compute_poke_amplitudes(loop.bench, loop.reference.m2c, poke_size)
-        if is_last_poke:
-            amplitude = scale_to_strehl_budget(amplitude, target.budget, *_strehl_cost(loop, state))
-        state.amplitude = float(amplitude.max())
-        accuracy = target.accuracy * (1 if is_last_poke else _EARLY_ACCURACY_FACTOR)
-        segment = yield from loop.measure(
-            min_frames, amplitude, f"round {len(state.rounds) + 1}, poke {amplitude.max():.2g}",
-            max_frames=target.frames, is_sufficient=partial(_is_accurate, target=accuracy),
+    def _record_round(
+        self,
+        segment: LoopSegment,
+        measured: OpticalGainEstimate,
+        amplitude: NDArray[np.float64],
+        accuracy: float,
+    ) -> GainRound:
+        """Append a round to the results."""
+        names = enumerate(self._comparison_names, 1)
+        self._comparisons = {name: _smooth(measured, k) for k, name in names}
+        gains, previous = _smooth(measured), self._previous_gains()
+        expected = np.hypot(gains.best_sigma / gains.best, previous.best_sigma / previous.best)
+        expected = np.hypot(expected, math.hypot(gains.common_sigma, previous.common_sigma))
+        images = segment.record.science
+        ratios = None
+        if self._model_psf is not None and images.count >= MIN_SAMPLES:
+            ratios = strehl(images.images(), self._model_psf)
+        one = GainRound(
+            gains, float(amplitude.max()), segment.frames, rms(gains.best / clip_gains(previous) - 1),
+            rms(expected), segment.residual_nm, strehl_loss(amplitude, *self._strehl_cost()),
+            _relative_error(gains) <= accuracy, ratios,
         )  # fmt: skip
-        if segment.diverged or segment.gains is None or _residual_is_high(segment, state):
-            _lower_gain(loop, segment, state)
-            continue
-        state.comparisons = {name: _smooth(segment.gains, k + 1) for k, name in enumerate(comparison_names)}
-        _record_round(loop, segment, segment.gains, amplitude, accuracy, target.model_psf, state)
-        yield _progress(state)
-        last = state.rounds[-1]
-        is_confirmed = last.reached and last.change <= max(_TOLERANCE, 2 * last.expected_change)
-        state.converged = is_last_poke and is_confirmed
-        repeats += is_last_poke
-        poke_size = max(target.poke, poke_size * _POKE_FACTOR)
+        self._rounds.append(one)
+        return one
 
+    def _previous_gains(self) -> OpticalGains:
+        if self._applied is None:
+            raise RuntimeError("no gains were measured yet")
+        return self._applied
 
-def _lower_gain(loop: GainMeasurementLoop, segment: LoopSegment, state: _BootstrapState) -> None:
-    """Open an unstable loop and reduce its gain; raises after :data:`_MAX_RETRIES` reductions."""
-    state.retries += 1
-    if state.retries > _MAX_RETRIES:
-        reason = "diverged" if segment.diverged else (segment.reason or "oscillates")
-        raise CalibrationError(
-            f"the loop does not stay closed: at an effective gain of {state.gain:.2f} it {reason}; "
-            "lower loop.gain, drop more modes, or measure the matrix again"
+    def _apply_gains(self, gains: OpticalGains) -> Progress:
+        """Scale the matrix by the gains, so that the gain of the integrator is the effective one."""
+        self._applied = gains
+        self._loop.scale(clip_gains(gains))
+        self._loop.control.set_gain(self._gain)
+        arrays = {"gains": gains.value, "gains_sigma": gains.sigma, "gains_smooth": gains.trend}
+        count = len(self._rounds)
+        if count:
+            arrays["gains_rounds"] = np.stack([one.gains.best for one in self._rounds])
+        small = {name: array.astype(np.float32) for name, array in arrays.items()}
+        return Progress("optical gains", count, max(count, 1), "round", arrays=small)
+
+    def _strehl_cost(self) -> tuple[float, float, float]:
+        """Stroke [m], wavelength [m], and amplification of the variance of pokes by the loop."""
+        bench = self._loop.bench
+        delay = float(self._loop.reference.metrics.get("delay_frames", 2.0))
+        factor = noise_gain(self._gain, bench.config.loop.leak, delay)
+        return bench.dm.info.stroke_m, bench.config.system.wavelength_m, factor
+
+    def save_partial_round(self) -> None:
+        """Append an aborted round if it had enough frames; the loop is opened next."""
+        self._partial = True
+        measured = self._loop.solve_latest()
+        if self._applied is None or measured is None:
+            return
+        gains = _smooth(measured)
+        change = rms(gains.best / clip_gains(self._applied) - 1)
+        self._rounds.append(
+            GainRound(
+                gains, self._largest_amplitude, measured.frames, change, math.nan, math.nan, math.nan, False
+            )
         )
-    state.gain *= _GAIN_REDUCTION
-    state.notes.append(f"the loop was not stable; its gain was lowered to {state.gain:.3g}")
-    loop.open_loop()
-    loop.control.set_gain(state.gain)
+        self._applied = gains
 
-
-def _progress(state: _BootstrapState) -> Progress:
-    """The gains of all rounds so far."""
-    gains, count = _applied(state), len(state.rounds)
-    arrays = {"gains": gains.value, "gains_sigma": gains.sigma, "gains_smooth": gains.trend}
-    if count:
-        arrays["gains_rounds"] = np.stack([one.gains.best for one in state.rounds])
-    small = {name: array.astype(np.float32) for name, array in arrays.items()}
-    return Progress("optical gains", count, max(count, 1), "round", arrays=small)
-
-
-def _is_accurate(measured: OpticalGainEstimate, target: float) -> bool:
-    """Whether the relative error of the gains is below the target."""
-    return _relative_error(_smooth(measured)) <= target
-
-
-def _residual_is_high(segment: LoopSegment, state: _BootstrapState) -> bool:
-    """Whether the residual is far above those of the first closure.
-
-    The slopes of a pyramid saturate before the mirror does, so divergence is not detected by the limits.
-    """
-    known = [step.residual_nm for step in state.steps if step.stable and math.isfinite(step.residual_nm)]
-    return bool(known) and segment.residual_nm > 1.5 * max(known)
-
-
-def _record_round(
-    loop: GainMeasurementLoop,
-    segment: LoopSegment,
-    measured: OpticalGainEstimate,
-    amplitude: NDArray[np.float64],
-    accuracy: float,
-    model_psf: NDArray[np.float32] | None,
-    state: _BootstrapState,
-) -> None:
-    """Append a round to the results and scale the matrix by its gains."""
-    smoothed_gains, previous = _smooth(measured), _applied(state)
-    change = smoothed_gains.best / clip_gains(previous) - 1
-    expected = np.hypot(smoothed_gains.best_sigma / smoothed_gains.best, previous.best_sigma / previous.best)
-    expected = np.hypot(expected, math.hypot(smoothed_gains.common_sigma, previous.common_sigma))
-    state.rounds.append(
-        GainRound(
-            smoothed_gains, float(amplitude.max()), segment.frames, rms(change), rms(expected),
-            segment.residual_nm, strehl_loss(amplitude, *_strehl_cost(loop, state)),
-            _relative_error(smoothed_gains) <= accuracy, _strehl(segment, model_psf),
-        )
-    )  # fmt: skip
-    _apply_gains(loop, state, smoothed_gains)
-
-
-def _applied(state: _BootstrapState) -> OpticalGains:
-    """The gains by which the matrix in use is scaled."""
-    if state.applied is None:
-        raise RuntimeError("no gains were measured yet")
-    return state.applied
-
-
-def _apply_gains(loop: GainMeasurementLoop, state: _BootstrapState, gains: OpticalGains) -> None:
-    """Scale the matrix by the gains, so that the gain of the integrator is the effective one."""
-    state.applied = gains
-    loop.scale(clip_gains(gains))
-    loop.control.set_gain(state.gain)
-
-
-def _strehl(segment: LoopSegment, model_psf: NDArray[np.float32] | None) -> StrehlEstimate | None:
-    """Strehl ratio of the science frames of a round; ``None`` if there are too few."""
-    if model_psf is None or segment.record.science.count < MIN_SAMPLES:
-        return None
-    return strehl(segment.record.science.images(), model_psf)
+    def build_run(
+        self, calibration: CalibrationResult, closed_loop_matrix: InteractionMatrix | None
+    ) -> GainsRun:
+        """The result, and the matrix scaled by its gains."""
+        rescaled_calibration = calibration
+        closed_loop_gains = self._comparisons.pop(_CLOSED_LOOP_MATRIX, None)
+        if self._rounds and self._applied is not None:
+            scaled, gains = calibration.matrix, self._applied
+            # An aborted run may lack the gains of the closed-loop matrix.
+            if closed_loop_matrix is not None and closed_loop_gains is not None:
+                scaled, gains = closed_loop_matrix, closed_loop_gains
+            sigma = np.hypot(gains.best_sigma, gains.best * gains.common_sigma)
+            matrix = scale_matrix(scaled, clip_gains(gains), sigma)
+            rescaled_calibration = replace(calibration, matrix=matrix, measured=None, partial=self._partial)
+            if not self._rounds[-1].reached:
+                self._notes.append(
+                    "the last round ended at its number of frames, before the requested accuracy"
+                )
+        result = GainsResult(
+            calibration.matrix.method, tuple(self._rounds), tuple(self._steps), self._converged, self._gain,
+            self._loop.frames, self._loop.lost_frames, self._comparisons, self._partial, tuple(self._notes),
+        )  # fmt: skip
+        return GainsRun(result, rescaled_calibration)
 
 
 def _smooth(measured: OpticalGainEstimate, reference: int = 0) -> OpticalGains:
     """Gains relative to one of the matrices of the loop, smoothed over the modes."""
     return smooth_over_modes(measured.value[reference], measured.sigma[reference], measured.common_sigma)
+
+
+def _is_accurate(measured: OpticalGainEstimate, target: float) -> bool:
+    return _relative_error(_smooth(measured)) <= target
 
 
 def _relative_error(gains: OpticalGains) -> float:
@@ -306,58 +332,3 @@ def _relative_error(gains: OpticalGains) -> float:
 def rms(values: NDArray[np.float64]) -> float:
     """Root mean square."""
     return float(np.sqrt(np.mean(np.square(values))))
-
-
-def _strehl_cost(loop: GainMeasurementLoop, state: _BootstrapState) -> tuple[float, float, float]:
-    """Stroke [m], wavelength [m], and amplification of the variance of pokes by the loop."""
-    bench = loop.bench
-    delay = float(loop.reference.metrics.get("delay_frames", 2.0))
-    factor = noise_gain(state.gain, bench.config.loop.leak, delay)
-    return bench.dm.info.stroke_m, bench.config.system.wavelength_m, factor
-
-
-def _save_partial_round(loop: GainMeasurementLoop, state: _BootstrapState) -> None:
-    """Append an aborted round if it had enough frames; the loop is opened next."""
-    measured = loop.solve_latest()
-    if state.applied is None or measured is None:
-        return
-    smoothed_gains = _smooth(measured)
-    change = smoothed_gains.best / clip_gains(state.applied) - 1
-    state.rounds.append(
-        GainRound(
-            smoothed_gains, state.amplitude, measured.frames, rms(change), math.nan, math.nan, math.nan, False
-        )
-    )
-    state.applied = smoothed_gains
-
-
-def _require_fractions(**numbers: float) -> None:
-    for name, value in numbers.items():
-        if not 0 < value < 1:
-            raise ConfigError(f"{name} is {value}; it must lie between 0 and 1")
-
-
-def _build_run(
-    loop: GainMeasurementLoop,
-    calibration: CalibrationResult,
-    closed_loop_matrix: InteractionMatrix | None,
-    state: _BootstrapState,
-    lost: int,
-) -> GainsRun:
-    rescaled_calibration, notes = calibration, list(state.notes)
-    closed_loop_gains = state.comparisons.pop(_CLOSED_LOOP_MATRIX, None)
-    if state.rounds and state.applied is not None:
-        scaled, gains = calibration.matrix, state.applied
-        # An aborted run may lack the gains of the closed-loop matrix.
-        if closed_loop_matrix is not None and closed_loop_gains is not None:
-            scaled, gains = closed_loop_matrix, closed_loop_gains
-        sigma = np.hypot(gains.best_sigma, gains.best * gains.common_sigma)
-        matrix = scale_matrix(scaled, clip_gains(gains), sigma)
-        rescaled_calibration = replace(calibration, matrix=matrix, measured=None, partial=state.partial)
-        if not state.rounds[-1].reached:
-            notes.append("the last round ended at its number of frames, before the requested accuracy")
-    result = GainsResult(
-        calibration.matrix.method, tuple(state.rounds), tuple(state.steps), state.converged, state.gain,
-        loop.frames, lost, state.comparisons, state.partial, tuple(notes),
-    )  # fmt: skip
-    return GainsRun(result, rescaled_calibration)

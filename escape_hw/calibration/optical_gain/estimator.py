@@ -18,12 +18,11 @@ from escape_hw.calibration.acquisition.pokes import RandomPokes
 from escape_hw.calibration.docrime.estimator import DocrimeEstimator
 from escape_hw.calibration.docrime.monitor import CHECK_GROWTH
 from escape_hw.calibration.docrime.response import ResponseEstimate
-from escape_hw.calibration.loop.control import build_integrator
+from escape_hw.calibration.loop.control import build_integrator, invert_matrix
 from escape_hw.calibration.loop.runner import LoopRecord, RunningLoop
 from escape_hw.calibration.optical_gain.matrix_comparison import projector, scale_matrix, slope_weights
 from escape_hw.errors import CalibrationError, IncompatibleProduct, TooFewFrames
 from escape_hw.pipeline.control.integrator import LeakyIntegrator
-from escape_hw.pipeline.control.reconstructor import reconstructor
 
 #: Frames per mode from which the noise of the projected slopes is estimated.
 _NOISE_FRAMES_PER_MODE = 3
@@ -41,8 +40,6 @@ class OpticalGainEstimate:
         Temporal response, earlier measurements included.
     common_sigma
         Relative standard error common to all gains, from that of the response.
-    frames, lost_frames
-        Number of frames used and lost.
     """
 
     value: NDArray[np.float64]
@@ -189,16 +186,7 @@ class GainMeasurementLoop:
     The temporal response does not depend on the gains, so each measurement uses that of the earlier ones,
     which usually had larger pokes. Measure within ``with loop.closed():``.
 
-    Parameters
-    ----------
-    bench
-        An open bench.
-    calibration
-        The matrix that closes the loop, with its geometry.
-    comparisons
-        Other matrices of the same geometry and modes whose gains are measured as well.
-    science
-        Whether to accumulate the frames of the science camera.
+    ``comparisons``: other matrices of the same geometry and modes whose gains are measured as well.
 
     Raises
     ------
@@ -220,8 +208,6 @@ class GainMeasurementLoop:
         self._references = [self.reference, *comparisons.values()]
         self._weights = slope_weights(calibration.measured or self.reference)
         self.control: LeakyIntegrator = build_integrator(bench, self.reference, calibration.grid)
-        self._dropped = bench.config.loop.dropped_modes
-        self._stroke = np.sqrt(np.mean(np.square(self.reference.m2c), axis=0))
         self._known_response: ResponseEstimate | None = None
         # Raises, before anything moves, if a mode is dominated by noise.
         self._estimator = self._new_estimator()
@@ -250,9 +236,7 @@ class GainMeasurementLoop:
         Raises :class:`CalibrationError` if the scaled matrix cannot be inverted.
         """
         matrix = scale_matrix(self.reference, gains)
-        self.control.set_reconstructor(
-            reconstructor(matrix.data, scale=self._stroke, dropped_modes=self._dropped)
-        )
+        self.control.set_reconstructor(invert_matrix(matrix, self.bench.config.loop.dropped_modes))
 
     def measure(
         self,
@@ -271,8 +255,6 @@ class GainMeasurementLoop:
             Smallest number of frames.
         amplitude
             Amplitude of the pokes ``(n_modes,)``.
-        stage
-            Name of the stage in progress reports.
         max_frames
             Largest number of frames; ``frames`` by default.
         is_sufficient

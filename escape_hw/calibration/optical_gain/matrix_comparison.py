@@ -19,12 +19,8 @@ def deviation_ratio(measured: InteractionMatrix, reference: InteractionMatrix) -
     Noise increases a standard deviation, so the gain of a noisy column is biased to large values:
     ``E[stdev^2] = stdev_0^2 + mean(sigma^2)``. :func:`projection` has no such bias.
 
-    Parameters
-    ----------
-    measured
-        Matrix for the wavefront at which the gains are wanted (the paper's D).
-    reference
-        Matrix for another wavefront.
+    ``measured``: matrix for the wavefront at which the gains are wanted (the paper's D); ``reference``:
+    matrix for another wavefront.
 
     Returns
     -------
@@ -80,16 +76,10 @@ def projector(reference: InteractionMatrix, weights: NDArray[np.float64]) -> NDA
     ``P_m = r_m^T W / (r_m^T W r_m - sum(w sigma_m^2))``, with ``r_m`` the columns of the reference. The
     second term corrects the bias due to the noise of the reference.
 
-    Parameters
-    ----------
-    reference
-        Matrix relative to which the gains are defined.
-    weights
-        Weights of the slopes ``(n_slopes,)``, independent of the values of the data.
+    ``reference``: matrix relative to which the gains are defined; ``weights``: weights of the slopes
+    ``(n_slopes,)``, independent of the values of the data.
 
-    Returns
-    -------
-    ndarray, ``(n_modes, n_slopes)``
+    Returns ``(n_modes, n_slopes)``.
 
     Raises
     ------
@@ -112,11 +102,6 @@ def projection(measured: InteractionMatrix, reference: InteractionMatrix) -> Val
     """Optical gains by weighted regression of a matrix on a reference, without bias from noise.
 
     ``g_m = r_m^T W d_m / (r_m^T W r_m - sum(w sigma^2))`` with weights from the standard errors.
-
-    Parameters
-    ----------
-    measured, reference
-        As for :func:`deviation_ratio`.
 
     Returns
     -------
@@ -145,12 +130,8 @@ def scale_matrix(
 ) -> InteractionMatrix:
     """The matrix for the wavefront at which the gains were measured (paper: ``OG . D``).
 
-    Parameters
-    ----------
-    matrix
-        ``(n_slopes, n_modes)``.
-    gains, sigma
-        Gain of every mode and its standard error ``(n_modes,)``, which is added to those of the elements.
+    ``matrix``: ``(n_slopes, n_modes)``; ``gains``, ``sigma``: gain of every mode and its standard error
+    ``(n_modes,)``, which is added to those of the elements.
 
     Raises
     ------

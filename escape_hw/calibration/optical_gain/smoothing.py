@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.polynomial import legendre
 from numpy.typing import NDArray
@@ -36,12 +34,8 @@ def smooth_over_modes(
     independent. The result is an average over the sizes of curvature and departures, weighted by the
     restricted likelihood, with the noise given by the standard errors.
 
-    Parameters
-    ----------
-    value, sigma
-        Gain of every mode and its standard error ``(n_modes,)``, infinite where it was not measured.
-    common_sigma
-        Relative standard error common to all modes, copied to the result.
+    ``value``, ``sigma``: gain of every mode and its standard error ``(n_modes,)``, infinite where it was not
+    measured; ``common_sigma``: relative standard error common to all modes, copied to the result.
 
     Raises
     ------
@@ -58,7 +52,7 @@ def smooth_over_modes(
     scale = abs(float(np.average(value[is_measured], weights=sigma[is_measured] ** -2.0)))
     wiener = _wiener_covariance(x) * scale**2
     fits = [
-        _KrigingFit.from_gains(x, value, sigma, is_measured, wiener * trend_size**2, scale * departure_size)
+        _KrigingFit(x, value, sigma, is_measured, wiener * trend_size**2, scale * departure_size)
         for trend_size in _TREND_SIZES
         for departure_size in _DEPARTURE_SIZES
     ]
@@ -116,46 +110,32 @@ def _wiener_covariance(x: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(low**2 * (3 * high - low) / 6)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
 class _KrigingFit:
-    """Kriging with a linear drift: a line without prior plus a Gaussian process."""
+    """Kriging with a linear drift: a line without prior plus a Gaussian process.
 
-    drift_basis: NDArray[np.float64]
-    kernel: NDArray[np.float64]
-    departure_size: float
-    is_measured: NDArray[np.bool_]
-    factor: tuple[NDArray[np.float64], bool]
-    normal: NDArray[np.float64]
-    coefficients: NDArray[np.float64]
-    residual: NDArray[np.float64]
-    log_likelihood: float
+    For a covariance of the trend (``kernel``) and a size of the departures, with its restricted likelihood.
+    """
 
-    @classmethod
-    def from_gains(
-        cls,
+    def __init__(
+        self,
         x: NDArray[np.float64],
         value: NDArray[np.float64],
         sigma: NDArray[np.float64],
         is_measured: NDArray[np.bool_],
         kernel: NDArray[np.float64],
         departure_size: float,
-    ) -> _KrigingFit:
-        """Fit for a covariance of the trend and a size of the departures, with its restricted likelihood."""
-        drift_basis = np.stack([np.ones_like(x), x], axis=1)
-        line = drift_basis[is_measured]
-        factor = cho_factor(
-            kernel[np.ix_(is_measured, is_measured)] + np.diag(sigma[is_measured] ** 2 + departure_size**2),
-            lower=True,
-        )
-        normal = line.T @ cho_solve(factor, line)
-        coefficients = np.linalg.solve(normal, line.T @ cho_solve(factor, value[is_measured]))
-        residual = value[is_measured] - line @ coefficients
-        log_likelihood = 2 * np.log(np.diag(factor[0])).sum() + np.linalg.slogdet(normal)[1]
-        log_likelihood = -0.5 * float(log_likelihood + residual @ cho_solve(factor, residual))
-        return cls(
-            drift_basis, kernel, departure_size, is_measured, factor, normal, coefficients, residual,
-            log_likelihood,
-        )  # fmt: skip
+    ) -> None:
+        self.kernel, self.departure_size, self.is_measured = kernel, departure_size, is_measured
+        self.drift_basis = np.stack([np.ones_like(x), x], axis=1)
+        line = self.drift_basis[is_measured]
+        noise = np.diag(sigma[is_measured] ** 2 + departure_size**2)
+        self.factor = cho_factor(kernel[np.ix_(is_measured, is_measured)] + noise, lower=True)
+        self.normal = line.T @ cho_solve(self.factor, line)
+        self.coefficients = np.linalg.solve(self.normal, line.T @ cho_solve(self.factor, value[is_measured]))
+        self.residual = value[is_measured] - line @ self.coefficients
+        determinants = 2 * np.log(np.diag(self.factor[0])).sum() + np.linalg.slogdet(self.normal)[1]
+        square = self.residual @ cho_solve(self.factor, self.residual)
+        self.log_likelihood = -0.5 * float(determinants + square)
 
     def posterior(self, *, with_departures: bool) -> ValuesAndErrors:
         """Mean and standard error of the trend, or of the gains ``with_departures``."""

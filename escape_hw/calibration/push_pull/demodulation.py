@@ -44,14 +44,7 @@ class SpectralLines:
 def choose_line_frequencies(n_modes: int, frames: int, band: tuple[float, float]) -> NDArray[np.float64]:
     """Choose angular frequencies for the modes of a batch.
 
-    Parameters
-    ----------
-    n_modes
-        Number of modes to drive.
-    frames
-        Frames of the batch.
-    band
-        Lowest and highest frequency in cycles per frame.
+    ``band``: lowest and highest frequency in cycles per frame.
 
     Returns
     -------
@@ -144,12 +137,7 @@ def estimate_delay(lines: SpectralLines, max_delay: float) -> tuple[float, float
     ``sum_s Z_s^2`` has twice the phase of ``H`` for any signs of ``D``. Lines at several frequencies make the
     delay unambiguous.
 
-    Parameters
-    ----------
-    lines
-        Output of :func:`fit_lines`.
-    max_delay
-        Largest delay of the search in frames.
+    ``max_delay``: largest delay of the search in frames.
     """
     weight = 1 / np.mean(np.square(lines.sigma), axis=0)
     square = np.sum(lines.amplitude**2, axis=0) * weight

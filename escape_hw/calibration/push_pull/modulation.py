@@ -7,22 +7,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from escape_hw.api.interaction_matrix import snr_per_mode
 from escape_hw.api.procedure import Procedure, Reporter
 from escape_hw.api.results import CalibrationResult, TemporalResponse
 from escape_hw.api.sensor import SensorGeometry
 from escape_hw.bench import Bench
 from escape_hw.calibration.acquisition.checkpoint import Checkpoint
-from escape_hw.calibration.acquisition.frames import (
-    build_interaction_matrix,
-    next_frame,
-    validate_frame_count,
-)
-from escape_hw.calibration.acquisition.pokes import compute_poke_amplitudes
-from escape_hw.calibration.acquisition.preview import MatrixPreview
-from escape_hw.calibration.acquisition.sensor_setup import build_slope_function, ensure_sensor_ready
-from escape_hw.calibration.acquisition.stopping import Target, reject_accuracy_target
-from escape_hw.calibration.modes.bases import build_modal_basis
+from escape_hw.calibration.acquisition.frames import next_frame, validate_frame_count
+from escape_hw.calibration.acquisition.stopping import Target
 from escape_hw.calibration.push_pull.demodulation import (
     SpectralLines,
     choose_line_frequencies,
@@ -30,8 +21,8 @@ from escape_hw.calibration.push_pull.demodulation import (
     estimate_delay,
     fit_lines,
 )
-from escape_hw.calibration.push_pull.run_state import MAX_ROUNDS, ModeByModeRun
-from escape_hw.errors import Aborted, CalibrationError
+from escape_hw.calibration.push_pull.mode_by_mode import Measurement, ModeByModeRun
+from escape_hw.errors import CalibrationError
 from escape_hw.io.fits.run_state import RunState
 
 #: Band of the lines in cycles per frame: above most of the turbulence and vibrations, and below frequencies
@@ -63,15 +54,8 @@ def modulation_demodulation(
         An open bench, loop open.
     frames
         Frames per batch; by default as configured (``calibration.modulated_frames``).
-    poke
-        Amplitude of each mode, rms surface as fraction of full stroke; by default as configured.
-    grid
-        Geometry of the sensor; found first if not given.
-    until
-        Repeat each batch until all its modes have this signal-to-noise ratio, at most
-        :data:`~escape_hw.calibration.push_pull.run_state.MAX_ROUNDS` times.
-    checkpoint
-        Where the state is saved, and the state to resume from.
+    poke, grid, until, checkpoint
+        As for :func:`~escape_hw.calibration.push_pull.procedure.push_pull`, with batches for modes.
 
     Returns
     -------
@@ -81,155 +65,111 @@ def modulation_demodulation(
 
     Raises
     ------
-    ConfigError
-        The number of frames, the poke or the target is out of range; nothing moved.
-    ProductError
-        The state to resume from is damaged or of another run; nothing moved.
+    ConfigError, ProductError, CalibrationError, Aborted
+        As for :func:`~escape_hw.calibration.push_pull.procedure.push_pull`.
     TooFewFrames
-        Too few frames for a single line.
-    CalibrationError
-        No spots or pupil images, no light, or no response.
-    Aborted
-        Aborted before the first batch was measured.
+        Too few frames for a single line; nothing moved.
     """
     c = bench.config.calibration
     n_frames = c.modulated_frames if frames is None else validate_frame_count(frames)
-    m2c = build_modal_basis(bench)
-    amplitude = compute_poke_amplitudes(bench, m2c, c.poke if poke is None else poke)
-    n_modes = m2c.shape[1]
-    modes_per_batch = choose_line_frequencies(n_modes, n_frames, BAND).size
-    batches = np.array_split(np.arange(n_modes), -(-n_modes // modes_per_batch))
-    reject_accuracy_target(until)
-    settings = {"poke": float(amplitude.max()), "frames": n_frames}
-    state = None if checkpoint is None else checkpoint.begin(bench, "modulated", m2c, settings)
-    try:
-        grid, mean_frame = yield from ensure_sensor_ready(bench, grid if state is None else state.grid)
-        report = Reporter("modulation", len(batches) * (n_frames + _SETTLING_FRAMES))
-        run = _ModulationRun(
-            bench, build_slope_function(bench, grid), report, mean_frame, checkpoint, frames=n_frames
-        )
-        if state is not None:
-            run.restore(state)
-        partial, preview = False, MatrixPreview(n_modes, lambda: grid)
-        try:
-            for modes in batches[len(run.batch_lines) :]:
-                yield from run.measure(m2c[:, modes], amplitude[modes], until)
-                if preview.is_due():
-                    yield report.now(preview(lambda: run.estimate_matrix(c.lags)))
-        except Aborted:
-            run.save_if_due(final=True)
-            if not run.batch_lines:
-                raise
-            partial = True
-    finally:
-        bench.dm.flatten()
-    lines = _concatenate_lines(run.batch_lines)
+    run = _ModulationRun(bench, c.poke if poke is None else poke, n_frames, until, checkpoint)
+    poke = float(run.amplitude.max())
+    partial = yield from run.measure(grid, {"poke": poke, "frames": n_frames})
+    lines = run.all_lines()
     delay, error = estimate_delay(lines, c.lags - 1)
     data, sigma = compute_matrix(lines, delay)
     if np.mean(np.square(data / np.maximum(sigma, 1e-300))) < _MIN_MEAN_POWER:
         raise CalibrationError(
             "the sensor does not respond to the mirror; check that the light is on and the mirror moves"
         )
-    delivered, lost = run.count_frames()
-    matrix = build_interaction_matrix(
-        bench, grid, m2c[:, : data.shape[1]], data, sigma, "modulated",
-        frames=delivered, lost_frames=lost, poke=float(amplitude.max()), batches=len(run.batch_lines),
-        delay_frames=delay, delay_sigma=error,
-    )  # fmt: skip
-    return CalibrationResult(
-        matrix, run.slope_statistics.annotate_geometry(grid), delivered, lost,
-        (delivered + lost) / bench.wfs.settings.frame_rate_hz, _as_temporal_response(delay, error, c.lags),
-        partial=partial, mean_frame=run.mean_frame,
+    return run.build_result(
+        data, sigma, partial, _as_temporal_response(delay, error, c.lags),
+        poke=poke, batches=len(run.steps), delay_frames=delay, delay_sigma=error,
     )  # fmt: skip
 
 
 class _ModulationRun(ModeByModeRun):
-    """Batches measured so far, of ``frames`` frames each."""
+    """One batch of modes per step of ``frames`` frames."""
 
-    def __init__(self, *args: Any, frames: int) -> None:
-        super().__init__(*args)
-        self.frames = frames
-        self.batch_lines: list[SpectralLines] = []
+    method = "modulated"
 
-    def restore(self, state: RunState) -> None:
-        super().restore(state)
+    def __init__(
+        self, bench: Bench, poke: float, frames: int, until: Target | None, checkpoint: Checkpoint | None
+    ) -> None:
+        super().__init__(bench, poke, frames, until, checkpoint)
+        n_modes = self.m2c.shape[1]
+        modes_per_batch = choose_line_frequencies(n_modes, frames, BAND).size
+        self._batches = np.array_split(np.arange(n_modes), -(-n_modes // modes_per_batch))
+        self._frequencies = [choose_line_frequencies(batch.size, frames, BAND) for batch in self._batches]
+
+    @property
+    def n_steps(self) -> int:
+        return len(self._batches)
+
+    def prepare(self) -> Procedure[Reporter]:
+        yield from ()
+        return Reporter("modulation", self.n_steps * (self.frames + _SETTLING_FRAMES))
+
+    def measure_step(self, step: int) -> Procedure[Measurement]:
+        """Drive the modes of a batch and fit their lines ``(n_slopes, n)``."""
+        bench, frequency = self.bench, self._frequencies[step]
+        m2c, amplitude = self.m2c[:, self._batches[step]], self.amplitude[self._batches[step]]
+        # Quadratic phases minimise the peak of the sum of many sinusoids (Schroeder 1970).
+        phase = np.pi * np.arange(amplitude.size) ** 2 / amplitude.size
+        n_shapes = self.frames + _SETTLING_FRAMES
+        sinusoids = amplitude * np.sin(np.outer(np.arange(n_shapes), frequency) + phase)
+        shapes = sinusoids @ m2c.T
+        scale = _amplitude_scale(bench, shapes)
+        times: list[int] = []
+        slope_rows: list[NDArray[np.float32]] = []
+        first = None
+        while not times or times[-1] + 1 < n_shapes:
+            frame = next_frame(bench)
+            first = frame.index if first is None else first
+            # By the camera's frame index, so that a lost frame delays one shape and shifts none.
+            time = frame.index - first
+            slopes = self.slopes_of(frame.data)
+            self.flux_monitor(self.slopes_of.flux)
+            self.slope_statistics.add(slopes)
+            times.append(time)
+            slope_rows.append(slopes)
+            bench.dm.send(shapes[min(time, n_shapes - 1)] * scale)
+            if progress := self.report.step():
+                yield progress
+        bench.dm.flatten()
+        at = np.array(times, np.int64)
+        settled = at >= _SETTLING_FRAMES
+        lines = fit_lines(
+            at[settled], np.stack(slope_rows)[settled], frequency, amplitude * scale, self.frames
+        )
+        return lines.amplitude * np.exp(-1j * phase), lines.sigma
+
+    def all_lines(self) -> SpectralLines:
+        """Lines of all batches so far."""
+        amplitudes, sigmas = zip(*self.steps, strict=True)
+        frequencies = self._frequencies[: len(self.steps)]
+        return SpectralLines(
+            np.concatenate(amplitudes, axis=1), np.concatenate(sigmas, axis=1), np.concatenate(frequencies)
+        )
+
+    def estimate_matrix(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        lines = self.all_lines()
+        return compute_matrix(lines, estimate_delay(lines, self.bench.config.calibration.lags - 1)[0])
+
+    def state(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+        arrays: dict[str, NDArray[Any]] = {}
+        for k, (amplitude, sigma) in enumerate(self.steps):
+            arrays[f"real{k}"], arrays[f"imaginary{k}"], arrays[f"sigma{k}"] = (
+                amplitude.real, amplitude.imag, sigma,
+            )  # fmt: skip
+        return {"batches": len(self.steps)}, arrays
+
+    def restore_steps(self, state: RunState) -> None:
         parts = state.arrays
-        self.batch_lines = [
-            SpectralLines(
-                parts[f"real{k}"] + 1j * parts[f"imaginary{k}"], parts[f"sigma{k}"], parts[f"frequency{k}"]
-            )
+        self.steps = [
+            (parts[f"real{k}"] + 1j * parts[f"imaginary{k}"], parts[f"sigma{k}"])
             for k in range(int(state.values["batches"]))
         ]
-
-    def measure(
-        self, m2c: NDArray[np.float64], amplitude: NDArray[np.float64], until: Target | None
-    ) -> Procedure[None]:
-        """Drive one batch, repeatedly until its modes have the target's signal-to-noise ratio."""
-        rounds: list[SpectralLines] = []
-        for _ in range(MAX_ROUNDS if until is not None else 1):
-            rounds.append((yield from _measure_batch(self, m2c, amplitude)))
-            lines = _average_lines(rounds)
-            # Of real and imaginary part together, which the response rotates into each other.
-            size = np.sqrt(np.maximum(np.square(np.abs(lines.amplitude)) - np.square(lines.sigma), 0.0))
-            if until is None or until.snr is None or snr_per_mode(size, lines.sigma).min() >= until.snr:
-                break
-        self.batch_lines.append(lines)
-        self.save_if_due()
-
-    def estimate_matrix(self, lags: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Matrix and standard errors of the batches so far ``(n_slopes, n)``."""
-        lines = _concatenate_lines(self.batch_lines)
-        return compute_matrix(lines, estimate_delay(lines, lags - 1)[0])
-
-    def save_if_due(self, *, final: bool = False) -> None:
-        arrays: dict[str, NDArray[Any]] = {}
-        for k, lines in enumerate(self.batch_lines):
-            arrays[f"real{k}"], arrays[f"imaginary{k}"] = lines.amplitude.real, lines.amplitude.imag
-            arrays[f"sigma{k}"], arrays[f"frequency{k}"] = lines.sigma, lines.frequency
-        if self.batch_lines:
-            self.checkpoint({"batches": len(self.batch_lines)}, arrays, final)
-
-
-def _average_lines(rounds: list[SpectralLines]) -> SpectralLines:
-    """Mean of the same lines from several rounds."""
-    variance = np.sum([np.square(lines.sigma) for lines in rounds], axis=0)
-    amplitude = np.mean([lines.amplitude for lines in rounds], axis=0)
-    return SpectralLines(amplitude, np.sqrt(variance) / len(rounds), rounds[0].frequency)
-
-
-def _measure_batch(
-    run: _ModulationRun, m2c: NDArray[np.float64], amplitude: NDArray[np.float64]
-) -> Procedure[SpectralLines]:
-    """Drive some modes for a batch of frames and fit their lines."""
-    bench, frames = run.bench, run.frames
-    frequency = choose_line_frequencies(amplitude.size, frames, BAND)
-    # Quadratic phases minimise the peak of the sum of many sinusoids (Schroeder 1970).
-    phase = np.pi * np.arange(amplitude.size) ** 2 / amplitude.size
-    sinusoids = amplitude * np.sin(np.outer(np.arange(frames + _SETTLING_FRAMES), frequency) + phase)
-    shapes = sinusoids @ m2c.T
-    scale = _amplitude_scale(bench, shapes)
-    times: list[int] = []
-    slope_rows: list[NDArray[np.float32]] = []
-    first = None
-    while not times or times[-1] + 1 < len(shapes):
-        frame = next_frame(bench)
-        first = frame.index if first is None else first
-        # By the camera's frame index, so that a lost frame delays one shape and shifts none.
-        step = frame.index - first
-        slopes = run.slopes_of(frame.data)
-        run.flux_monitor(run.slopes_of.flux)
-        run.slope_statistics.add(slopes)
-        times.append(step)
-        slope_rows.append(slopes)
-        bench.dm.send(shapes[min(step, len(shapes) - 1)] * scale)
-        if progress := run.report.step():
-            yield progress
-    bench.dm.flatten()
-    time = np.array(times, np.int64)
-    settled = time >= _SETTLING_FRAMES
-    lines = fit_lines(time[settled], np.stack(slope_rows)[settled], frequency, amplitude * scale, frames)
-    phase_correction = np.exp(-1j * phase)
-    return SpectralLines(lines.amplitude * phase_correction, lines.sigma, frequency)
 
 
 def _amplitude_scale(bench: Bench, shapes: NDArray[np.float64]) -> float:
@@ -240,14 +180,6 @@ def _amplitude_scale(bench: Bench, shapes: NDArray[np.float64]) -> float:
         largest_step = np.abs(np.diff(shapes, axis=0, prepend=0.0)).max()
         scale = min(scale, dm.limits.max_slew / max(float(largest_step), 1e-300))
     return scale
-
-
-def _concatenate_lines(batch_lines: list[SpectralLines]) -> SpectralLines:
-    return SpectralLines(
-        np.concatenate([lines.amplitude for lines in batch_lines], axis=1),
-        np.concatenate([lines.sigma for lines in batch_lines], axis=1),
-        np.concatenate([lines.frequency for lines in batch_lines]),
-    )
 
 
 def _as_temporal_response(delay: float, error: float, lags: int) -> TemporalResponse:

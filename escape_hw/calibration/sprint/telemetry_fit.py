@@ -20,7 +20,7 @@ from escape_hw.api.procedure import Procedure
 from escape_hw.api.registration import Registration
 from escape_hw.api.results import RegistrationEstimate, TemporalResponse
 from escape_hw.api.synthetic_model import SyntheticModel
-from escape_hw.calibration.acquisition.telemetry import AlignedTelemetry
+from escape_hw.calibration.acquisition.aligned_telemetry import AlignedTelemetry
 from escape_hw.calibration.docrime.regression import (
     MAX_CORRELATED_SLOPES,
     InstrumentalEquations,

@@ -84,8 +84,9 @@ class AlarmMonitor:
             )
         if self._response is not None and responses_differ(live.response, self._response):
             new_alarms["delay"] = (
-                f"the delay is {live.response.delay:.2f} frames instead of {self._response.delay:.2f}; check "
-                "exposure, frame rate, and the latency of the computer"
+                f"the delay is {live.response.delay_frames:.2f} frames instead of "
+                f"{self._response.delay_frames:.2f}; check exposure, frame rate, and the latency of "
+                "the computer"
             )
         worst = int(np.argmax(np.abs(live.actuator_gains)))
         if abs(live.actuator_gains[worst]) > ACTUATOR_GAIN_LIMIT:

@@ -12,9 +12,9 @@ from escape_hw.api.registration import PARAMETERS
 from escape_hw.api.results import Estimate, RegistrationEstimate
 from escape_hw.api.synthetic_model import SyntheticModel
 from escape_hw.api.tracking import Exchange
+from escape_hw.calibration.loop.control import invert_matrix
 from escape_hw.calibration.sprint.synthetic_matrix import compute_pseudo_synthetic_matrix
 from escape_hw.calibration.tracking.live_registration import LiveEstimate, scale_to_live_gains
-from escape_hw.pipeline.control.reconstructor import reconstructor
 
 #: Change of the matrix, in standard errors, above which it is significant.
 MIN_SIGNIFICANCE = 2.0
@@ -40,12 +40,6 @@ class ExchangeProposal:
     exceeds_threshold: bool
 
 
-def invert_matrix(matrix: InteractionMatrix, dropped: int) -> NDArray[np.float32]:
-    """Reconstructor of a matrix without its weakest eigenmodes per stroke."""
-    stroke = np.sqrt(np.mean(np.square(matrix.m2c), axis=0))
-    return reconstructor(matrix.data, scale=stroke, dropped_modes=dropped)
-
-
 def propose_exchange(
     synthetic: InteractionMatrix,
     model: SyntheticModel,
@@ -57,18 +51,8 @@ def propose_exchange(
 ) -> ExchangeProposal:
     """Compare the matrix at the live registration with the one in use.
 
-    Parameters
-    ----------
-    synthetic, model
-        Pseudo-synthetic matrix at the live registration and the live common gain, and its model.
-    live, in_use
-        The live registration, and the matrix in use.
-    dropped
-        Number of eigenmodes that the reconstructor omits.
-    seconds
-        Present time.
-    exchange_threshold
-        Relative change of the matrix above which an exchange is proposed.
+    ``synthetic``, ``model``: pseudo-synthetic matrix at the live registration and the live common gain, and
+    its model; ``exchange_threshold``: relative change of the matrix above which an exchange is proposed.
     """
     new = scale_to_live_gains(synthetic, live)
     scale = float(np.linalg.norm(new.data))

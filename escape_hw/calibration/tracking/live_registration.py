@@ -1,9 +1,10 @@
 """Live registration: one Gauss-Newton update of SPRINT per block of closed-loop telemetry.
 
 The updates use sums of the whitened telemetry with exponential forgetting
-(:mod:`~escape_hw.calibration.docrime.forgetting_sums`), start from the last estimate, and have the unknowns
-of a full fit: gain, registration, random effects, and on a pyramid the optical gains as a smooth curve over
-the modes. Double exponential smoothing (:class:`DoubleExponentialSmoother`) removes the lag of the memory.
+(:class:`~escape_hw.calibration.docrime.regression.ForgettingSums`), start from the last estimate, and have
+the unknowns of a full fit: gain, registration, random effects, and on a pyramid the optical gains as a
+smooth curve over the modes. Double exponential smoothing (:class:`DoubleExponentialSmoother`) removes the
+lag of the memory.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.registration import Registration
 from escape_hw.api.results import Estimate, RegistrationEstimate, TemporalResponse
 from escape_hw.api.synthetic_model import SyntheticModel
-from escape_hw.calibration.acquisition.telemetry import AlignedTelemetry
+from escape_hw.calibration.acquisition.aligned_telemetry import AlignedTelemetry
 from escape_hw.calibration.docrime.regression import ForgettingSums, whiten_columns
 from escape_hw.calibration.docrime.response import FilteredTelemetry, ResponseAccumulator, filter_telemetry
 from escape_hw.calibration.optical_gain.smoothing import compute_command_curves, gain_curve_basis
@@ -80,8 +81,6 @@ class LiveEstimate:
         Relative gain of every actuator beyond the common one ``(n_act,)``.
     matrix
         The fitted matrix, random effects included ``(n_slopes, n_modes)``.
-    response
-        Temporal response.
     """
 
     registration: RegistrationEstimate
@@ -118,8 +117,6 @@ class LiveRegistration:
         Seconds between updates.
     n_curve_coefficients
         Coefficients of the curve of optical gains over the modes; 0: one gain for all modes.
-    response
-        Temporal response, if it is known.
     """
 
     def __init__(
@@ -171,12 +168,8 @@ class LiveRegistration:
     def update(self, data: AlignedTelemetry, start: int = 0) -> LiveEstimate:
         """Estimate the registration with one more block of frames.
 
-        Parameters
-        ----------
-        data
-            Closed-loop telemetry: slopes, total modal commands, and the pokes in them.
-        start
-            First new row, after :attr:`memory_rows` rows of history.
+        ``data``: closed-loop telemetry: slopes, total modal commands, and the pokes in them; ``start``: first
+        new row, after :attr:`memory_rows` rows of history.
 
         Raises
         ------
@@ -401,12 +394,8 @@ class DoubleExponentialSmoother:
     ) -> SmoothedState:
         """Add the estimate from the forgotten sums.
 
-        Parameters
-        ----------
-        mean
-            The estimate ``(n,)``.
-        noise, static
-            Covariances ``(n, n)`` of its noise, independent from frame to frame, and of its constant errors.
+        ``mean``: the estimate ``(n,)``; ``noise``, ``static``: covariances ``(n, n)`` of its noise,
+        independent from frame to frame, and of its constant errors.
         """
         self._weight = self._forgetting * self._weight + 1
         share = 1 / self._weight

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import math
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -14,15 +13,16 @@ from numpy.typing import NDArray
 from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.procedure import Procedure, Progress, Reporter
 from escape_hw.api.registration import PARAMETERS, TO_STREAM_UNITS
-from escape_hw.api.results import CalibrationResult, RegistrationEstimate, TemporalResponse
+from escape_hw.api.results import CalibrationResult, Estimate, RegistrationEstimate, TemporalResponse
 from escape_hw.api.sensor import SensorGeometry
 from escape_hw.api.tracking import Alarm, TrackResult
 from escape_hw.bench import Bench
-from escape_hw.calibration.acquisition.pokes import compute_poke_amplitudes
+from escape_hw.calibration.acquisition.aligned_telemetry import AlignedTelemetry, TelemetryBuffer
+from escape_hw.calibration.acquisition.pokes import RandomPokes, compute_poke_amplitudes
 from escape_hw.calibration.acquisition.slope_statistics import SlopeStatistics
-from escape_hw.calibration.acquisition.telemetry import AlignedTelemetry, TelemetryBuffer
-from escape_hw.calibration.loop.control import build_integrator
-from escape_hw.calibration.loop.divergence import BlockResidualMonitor, DivergenceLimits
+from escape_hw.calibration.loop.control import build_integrator, invert_matrix
+from escape_hw.calibration.loop.divergence import BlockResidualMonitor
+from escape_hw.calibration.loop.performance import peak_strehl
 from escape_hw.calibration.loop.runner import SETTLING_S, RunningLoop
 from escape_hw.calibration.optical_gain.smoothing import COEFFICIENT_SIGMA
 from escape_hw.calibration.sprint.fit import sprint, sprint_options_from_config
@@ -31,16 +31,12 @@ from escape_hw.calibration.tracking.alarms import AlarmMonitor
 from escape_hw.calibration.tracking.exchange import (
     ActiveReconstructor,
     ExchangeProposal,
-    invert_matrix,
     propose_exchange,
 )
 from escape_hw.calibration.tracking.live_registration import LiveEstimate, LiveRegistration
 from escape_hw.errors import Aborted, CalibrationError, ConfigError, TooFewFrames
 from escape_hw.pipeline.psf.frame_stack import FrameStack
-from escape_hw.pipeline.psf.strehl import strehl
 from escape_hw.pipeline.statistics import MIN_SAMPLES
-
-log = logging.getLogger(__name__)
 
 #: Seconds between two updates of the registration.
 STEP_S = 1.0
@@ -75,14 +71,8 @@ def track(
 
     Parameters
     ----------
-    bench, matrix, grid
-        An open bench, the matrix at the start, and its geometry.
-    seconds
-        Duration.
     registration
         The registration of the matrix; fitted to the matrix by default.
-    response
-        Temporal response, if it is known.
     poke
         Pokes are uniform in +-poke on every mode, rms surface as fraction of full stroke; as configured.
     forgetting_time_s
@@ -130,8 +120,8 @@ class TrackerUpdate:
     synthetic: CalibrationResult
     #: That matrix at the live gains, compared with the one in use.
     proposal: ExchangeProposal
-    #: Strehl ratio and its error; NaN without one.
-    strehl: tuple[float, float]
+    #: NaN without one.
+    strehl: Estimate
 
 
 class _Tracker:
@@ -158,7 +148,7 @@ class _Tracker:
             raise CalibrationError(
                 f"the matrix has no registration to start from: {'; '.join(start.warnings)}"
             )
-        self.amplitude = compute_poke_amplitudes(bench, matrix.m2c, poke)
+        self.pokes = RandomPokes(compute_poke_amplitudes(bench, matrix.m2c, poke), bench.rng)
         self.response, self.memory = response, forgetting_time_s / STEP_S
         self.dropped = bench.config.loop.dropped_modes
         self.in_use = ActiveReconstructor(matrix, invert_matrix(matrix, self.dropped), start, 1.0)
@@ -170,7 +160,7 @@ class _Tracker:
         self.pending_update: Future[TrackerUpdate | None] | None = None
         self.metrics: dict[str, float] = {}
         self.arrays: dict[str, NDArray[np.float32]] = {}
-        self.divergence_monitor = BlockResidualMonitor(DivergenceLimits.from_config(bench.config))
+        self.divergence_monitor = BlockResidualMonitor(bench.config.server)
 
     def prepare(self, slope_statistics: SlopeStatistics) -> None:
         """Build the model for the closed loop and start the live registration; in the worker thread.
@@ -228,7 +218,7 @@ class _Tracker:
         ready.result()
         for second in range(report.total):
             frames, shortened = loop.record.frames, loop.record.shortened
-            steps = loop.run(self.frames, inject=self._draw_poke, observe=[self.buffer])
+            steps = loop.run(self.frames, inject=self.pokes, observe=[self.buffer])
             yield from self._forward_progress(steps, report, second)
             record = loop.record
             if record.diverged or self.divergence_monitor(
@@ -252,9 +242,6 @@ class _Tracker:
         for step in steps:
             arrays, self.arrays = self.arrays, {}
             yield report(done, {**step.arrays, **arrays}, **step.metrics, **self.metrics)
-
-    def _draw_poke(self) -> NDArray[np.float64]:
-        return self.amplitude * self.bench.rng.uniform(-1.0, 1.0, self.amplitude.size)
 
     def _elapsed_s(self) -> float:
         """Seconds since the loop was closed."""
@@ -280,18 +267,8 @@ class _Tracker:
             synthetic.matrix, self.model, live, self.in_use, self.dropped, seconds,
             self.bench.config.tracking.exchange_threshold,
         )  # fmt: skip
-        return TrackerUpdate(seconds, live, synthetic, proposal, self._strehl(images))
-
-    def _strehl(self, images: FrameStack | None) -> tuple[float, float]:
-        """Strehl ratio and its error; NaN without images, or if they are not centred on the camera."""
-        if images is None or self.psf is None:
-            return math.nan, math.nan
-        try:
-            peak = strehl(images.images(), self.psf).peak
-        except CalibrationError as error:
-            log.warning("no Strehl ratio: %s", error)
-            return math.nan, math.nan
-        return peak.value, peak.sigma
+        ratio = None if images is None or self.psf is None else peak_strehl(images, self.psf)
+        return TrackerUpdate(seconds, live, synthetic, proposal, ratio or Estimate(math.nan, math.nan))
 
     def _handle_update(self, loop: RunningLoop, running: bool = True) -> None:
         """Wait for the pending update, record it, raise alarms, and exchange the matrix if the loop runs."""
@@ -356,7 +333,7 @@ def build_row(
         "misfit": live.misfit, "innovation": live.innovation, "noise": live.noise,
         "mismatch": update.proposal.evidence.mismatch,
         "residual_nm": float(np.sqrt(np.mean(np.square(residual)))) if residual.size else math.nan,
-        "strehl": update.strehl[0], "strehl_sigma": update.strehl[1], "exchanged": float(exchanged),
+        "strehl": update.strehl.value, "strehl_sigma": update.strehl.sigma, "exchanged": float(exchanged),
     }  # fmt: skip
 
 

@@ -111,9 +111,8 @@ def export_milk(
         if file.suffix == ".npy":
             _publish(name, read_file(file).data, version)
             context.show(f"{name}: {shm_path(name)}")
-            context.result(
-                {**header_fields("export milk", None, None, None), "files": {name: shm_path(name)}}
-            )
+            document = header_fields("export milk", None, None, None)
+            context.result({**document, "files": {name: shm_path(name)}})
             return
         product = load_matrix(file)
         images = calibration_images(product.result, _system_config(product).devices.dm.actuator_map())
@@ -317,12 +316,9 @@ def _record_stream(context: CommandContext, command: str, stream: Stream, frames
         raise ProductError(str(error)) from error
     finally:
         stream.close()
-    counts = np.array([each.count for each in found])
+    counts, times = np.array([[each.count, each.written_ns] for each in found]).T
     buffer = io.BytesIO()
-    np.savez(
-        buffer, data=np.stack([each.data for each in found]), count=counts,
-        written_ns=np.array([each.written_ns for each in found]),
-    )  # fmt: skip
+    np.savez(buffer, data=np.stack([each.data for each in found]), count=counts, written_ns=times)
     write_atomic(out, buffer.getvalue())
     missed = int(counts[-1] - counts[0]) + 1 - len(found)
     context.show(f"{len(found)} arrays of {stream.shape} {stream.dtype}, {missed} missed: {out}")

@@ -43,7 +43,7 @@ def serve(
     with command_context("serve", json=json, quiet=quiet) as context:
         from escape_hw.errors import ConfigError
         from escape_hw.io.run_folder import default_runs_folder
-        from escape_hw.server.frontend.server import Server
+        from escape_hw.server.frontend.front_end import Server
 
         if port is None and bind != _LOOPBACK:
             raise ConfigError(f"--bind {bind} needs --port; without it the server has local sockets only")

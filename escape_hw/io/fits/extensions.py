@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -26,25 +26,61 @@ from escape_hw.errors import ProductError
 from escape_hw.io.fits import file as fits_file
 
 _PUPILS = "PUPILS"
+_COMMON_CARDS = {"COUNTS": "counts", "BACKGND": "background"}
+#: Header cards of every kind of geometry and the attribute that each holds; those that early versions did
+#: not write have a default there.
+_CARDS: dict[str, dict[str, str]] = {
+    SubApertureGrid.kind: {
+        "PITCH": "pitch_px", "MOTION": "motion_px", "AIR": "turbulence_px", **_COMMON_CARDS,
+    },
+    PyramidPupils.kind: {
+        "DIAMETER": "diameter_px", "MOTION": "motion", "CENTRESD": "centre_sigma_px", "POKES": "pokes",
+        "LOOKS": "n_effective", "STEADY": "persistent_fraction", "NORMAL": "normalisation",
+        "MODULAT": "modulation", **_COMMON_CARDS,
+    },
+}  # fmt: skip
+
+
+def geometry_cards(geometry: SensorGeometry) -> dict[str, float | str]:
+    """Scalars of a geometry by FITS keyword."""
+    values = {key: getattr(geometry, name) for key, name in _CARDS[geometry.kind].items()}
+    if isinstance(geometry, SubApertureGrid):
+        values |= {"ORIGINX": geometry.origin_px[0], "ORIGINY": geometry.origin_px[1]}
+    return {key: value if isinstance(value, str) else float(value) for key, value in values.items()}
+
+
+def geometry_fields(kind: str, cards: Mapping[str, Any]) -> dict[str, Any]:
+    """Inverse of :func:`geometry_cards` but for the origin: arguments of the geometry, where given."""
+    found = {name: cards[key] for key, name in _CARDS[kind].items() if key in cards}
+    return {name: value if isinstance(value, str) else float(value) for name, value in found.items()}
+
+
+def reference_slopes(geometry: SensorGeometry) -> NDArray[np.float32]:
+    """Reference slopes ``(n_valid, 2)`` in the unit of the slopes."""
+    if isinstance(geometry, PyramidPupils):
+        return np.asarray(geometry.references, np.float32)
+    return np.asarray(require_kind(geometry, SubApertureGrid).references_px, np.float32)
 
 
 def pack_grid(grid: SensorGeometry) -> list[Any]:
-    """The references with all numbers of the geometry as cards, and the flux map.
+    """The mask, the references with all numbers of the geometry as cards, and the flux map.
 
-    The card SENSOR gives the kind of sensor, the extension VALID the mask.
+    The card SENSOR gives the kind of sensor.
     """
-    pack, _ = _CONVERTERS[grid.kind]
-    references, cards, extra_extensions = pack(grid)
-    cards |= {"COUNTS": float(grid.counts), "BACKGND": float(grid.background), "SENSOR": grid.kind}
-    return [
-        fits_file.image_extension("GRID", np.asarray(references, np.float32), grid.slope_unit, **cards),
+    references, cards = reference_slopes(grid), {**geometry_cards(grid), "SENSOR": grid.kind}
+    hdus = [
+        fits_file.image_extension("VALID", grid.valid),
+        fits_file.image_extension("GRID", references, grid.slope_unit, **cards),
         fits_file.image_extension("FLUX", np.asarray(grid.flux, np.float32)),
-        *extra_extensions,
     ]
+    if isinstance(grid, PyramidPupils):
+        (x, y), (left, top) = grid.centres_px.T, grid.corners_px.T
+        hdus.append(fits_file.table_extension(_PUPILS, {"X": x, "Y": y, "CORNERX": left, "CORNERY": top}))
+    return hdus
 
 
 def unpack_grid(path: Path, hdus: fits.HDUList) -> SensorGeometry:
-    """Inverse of :func:`pack_grid`, with the mask from VALID.
+    """Inverse of :func:`pack_grid`.
 
     Raises
     ------
@@ -58,101 +94,25 @@ def unpack_grid(path: Path, hdus: fits.HDUList) -> SensorGeometry:
         raise ProductError(f"{path}: GRID has shape {references.shape}, VALID marks {int(valid.sum())}")
     # Products of early versions have no card SENSOR; they are Shack-Hartmann sensors.
     kind = str(header.get("SENSOR", SubApertureGrid.kind))
-    if kind not in _CONVERTERS:
-        raise ProductError(
-            f"{path}: its sensor is of kind '{kind}'; this version reads {', '.join(_CONVERTERS)}"
-        )
-    _, unpack = _CONVERTERS[kind]
-    common = {
+    if kind not in _CARDS:
+        raise ProductError(f"{path}: its sensor is of kind '{kind}'; this version reads {', '.join(_CARDS)}")
+    fields = {
         "valid": valid,
         "flux": fits_file.read_array(path, hdus, "FLUX", np.float32),
-        "counts": float(header["COUNTS"]),
-        "background": float(header["BACKGND"]),
+        **geometry_fields(kind, header),
     }
-    return unpack(path, hdus, references, common)
-
-
-_GeometryParts = tuple[NDArray[np.float32], dict[str, Any], list[Any]]
-
-
-def _pack_shack_hartmann(geometry: SensorGeometry) -> _GeometryParts:
-    grid = require_kind(geometry, SubApertureGrid)
-    cards = {
-        "PITCH": float(grid.pitch_px),
-        "ORIGINX": float(grid.origin_px[0]),
-        "ORIGINY": float(grid.origin_px[1]),
-        "MOTION": float(grid.motion_px),
-        "AIR": float(grid.turbulence_px),
-    }
-    return grid.references_px, cards, []
-
-
-def _unpack_shack_hartmann(
-    path: Path, hdus: fits.HDUList, references: NDArray[np.float32], common: dict[str, Any]
-) -> SubApertureGrid:
-    header = fits_file.require_extension(path, hdus, "GRID").header
-    return SubApertureGrid(
-        pitch_px=float(header["PITCH"]),
-        origin_px=(float(header["ORIGINX"]), float(header["ORIGINY"])),
-        references_px=references,
-        motion_px=float(header["MOTION"]),
-        # Products of earlier versions have none.
-        turbulence_px=float(header.get("AIR", 0.0)),
-        **common,
-    )
-
-
-def _pack_pyramid(geometry: SensorGeometry) -> _GeometryParts:
-    pupils = require_kind(geometry, PyramidPupils)
-    cards = {
-        "DIAMETER": float(pupils.diameter_px),
-        "MOTION": float(pupils.motion),
-        "CENTRESD": float(pupils.centre_sigma_px),
-        "POKES": float(pupils.pokes),
-        "LOOKS": float(pupils.n_effective),
-        "STEADY": float(pupils.persistent_fraction),
-        "NORMAL": fits_file.header_text(pupils.normalisation),
-        "MODULAT": float(pupils.modulation),
-    }
-    positions = {
-        "X": np.asarray(pupils.centres_px[:, 0], np.float64),
-        "Y": np.asarray(pupils.centres_px[:, 1], np.float64),
-        "CORNERX": np.asarray(pupils.corners_px[:, 0], np.int64),
-        "CORNERY": np.asarray(pupils.corners_px[:, 1], np.int64),
-    }
-    return pupils.references, cards, [fits_file.table_extension(_PUPILS, positions)]
-
-
-def _unpack_pyramid(
-    path: Path, hdus: fits.HDUList, references: NDArray[np.float32], common: dict[str, Any]
-) -> PyramidPupils:
-    header, table = (
-        fits_file.require_extension(path, hdus, "GRID").header,
-        fits_file.require_extension(path, hdus, _PUPILS).data,
-    )
+    if kind == SubApertureGrid.kind:
+        origin = (float(header["ORIGINX"]), float(header["ORIGINY"]))
+        return SubApertureGrid(origin_px=origin, references_px=references, **fields)
+    table = fits_file.require_extension(path, hdus, _PUPILS).data
     if len(table) != 4:
         raise ProductError(f"{path}: {_PUPILS} has {len(table)} rows; a pyramid makes four images")
     return PyramidPupils(
         centres_px=np.stack([table["X"], table["Y"]], axis=1).astype(np.float64),
-        diameter_px=float(header["DIAMETER"]),
         corners_px=np.stack([table["CORNERX"], table["CORNERY"]], axis=1).astype(np.intp),
         references=references,
-        motion=float(header["MOTION"]),
-        centre_sigma_px=float(header["CENTRESD"]),
-        # Products written before these were recorded do without.
-        pokes=float(header.get("POKES", 0.0)),
-        n_effective=float(header.get("LOOKS", 0.0)),
-        persistent_fraction=float(header.get("STEADY", 0.0)),
-        normalisation=str(header["NORMAL"]),
-        modulation=float(header["MODULAT"]),
-        **common,
+        **fields,
     )
-
-
-_CONVERTERS: dict[str, tuple[Callable[[SensorGeometry], _GeometryParts], Callable[..., SensorGeometry]]] = {
-    SubApertureGrid.kind: (_pack_shack_hartmann, _unpack_shack_hartmann),
-    PyramidPupils.kind: (_pack_pyramid, _unpack_pyramid),
-}
 
 
 def pack_metrics(metrics: Mapping[str, Any], name: str = "METRICS") -> fits.BinTableHDU:

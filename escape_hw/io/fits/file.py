@@ -9,10 +9,10 @@ from __future__ import annotations
 import hashlib
 import io
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Generic, Self, TypeVar
+from typing import Any, Generic, Self, TypeVar
 
 import numpy as np
 from astropy.io import fits
@@ -22,10 +22,6 @@ from numpy.typing import NDArray
 from escape_hw.errors import ProductError
 from escape_hw.io.provenance import Provenance, format_utc, get_git_state, get_software_version
 from escape_hw.io.storage import write_atomic
-
-if TYPE_CHECKING:
-    from astropy.io import fits as astropy_fits
-
 
 #: Version of the products' layout; a higher one is refused on reading.
 SCHEMA = 1
@@ -77,10 +73,7 @@ def image_extension(name: str, data: NDArray[Any], unit: str = "", **cards: Any)
     if data.dtype == np.bool_:
         data = data.astype(np.uint8)
     hdu = fits.ImageHDU(np.ascontiguousarray(data), name=name)
-    if unit:
-        hdu.header["BUNIT"] = header_text(unit)
-    for key, value in cards.items():
-        hdu.header[key] = header_text(value) if isinstance(value, str) else value
+    _set_cards(hdu, {"BUNIT": unit, **cards} if unit else cards)
     return hdu
 
 
@@ -100,9 +93,13 @@ def table_extension(name: str, columns: dict[str, NDArray[Any]], **cards: Any) -
         else:
             columns_out.append(fits.Column(key, "D", array=values.astype(np.float64)))
     hdu = fits.BinTableHDU.from_columns(columns_out, name=name)
+    _set_cards(hdu, cards)
+    return hdu
+
+
+def _set_cards(hdu: Any, cards: Mapping[str, Any]) -> None:
     for key, value in cards.items():
         hdu.header[key] = header_text(value) if isinstance(value, str) else value
-    return hdu
 
 
 def write(path: Path, hdus: Sequence[Any]) -> str:
@@ -124,6 +121,52 @@ def write(path: Path, hdus: Sequence[Any]) -> str:
     content = buffer.getvalue()
     write_atomic(path, content)
     return hashlib.sha256(content).hexdigest()
+
+
+def partial_path(path: Path) -> Path:
+    """The name under which an aborted run saves what it measured: ``im.partial.fits``."""
+    return path if path.name.endswith(".partial.fits") else path.with_suffix(".partial.fits")
+
+
+def write_product(
+    path: Path,
+    kind: str,
+    hdus: Sequence[Any],
+    system: str,
+    simulated: bool,
+    origin: Provenance | None = None,
+    *,
+    partial: bool = False,
+    cards: Mapping[str, tuple[Any, str]] | None = None,
+) -> Path:
+    """Write a product: primary header, extensions, and the configuration of its origin.
+
+    Parameters
+    ----------
+    path
+        File name; a partial product is written as ``*.partial.fits``.
+    hdus
+        Extensions that hold the result.
+    cards
+        Further cards of the primary header, each with its comment.
+
+    Returns
+    -------
+    Path
+        The file written.
+
+    Raises
+    ------
+    StorageError
+        The file cannot be written; no partial file remains.
+    """
+    origin = origin or Provenance()
+    path = partial_path(path) if partial else path
+    primary = primary_hdu(kind, system, simulated, partial, origin)
+    for key, (value, comment) in (cards or {}).items():
+        primary.header[key] = (header_text(value) if isinstance(value, str) else value, comment)
+    write(path, [primary, *hdus, text_extension("CONFIG", origin.config_text)])
+    return path
 
 
 def read(path: Path, kind: str | None = None) -> tuple[fits.HDUList, str]:
@@ -254,18 +297,9 @@ class Product(Generic[R]):
         cls,
         path: Path | str,
         kind: str,
-        unpack: Callable[[Path, astropy_fits.HDUList, dict[str, Any]], R],
+        unpack: Callable[[Path, fits.HDUList, dict[str, Any]], R],
     ) -> Self:
-        """Read a product of a kind.
-
-        Parameters
-        ----------
-        path
-            The file.
-        kind
-            What it must be.
-        unpack
-            Makes the result of path, parts and header.
+        """Read a product of a kind; ``unpack`` makes the result from path, HDUs and header.
 
         Raises
         ------

@@ -42,30 +42,23 @@ def save_frames(
     StorageError
         The file cannot be written.
     """
-    origin = origin or Provenance()
-    primary = fits_file.primary_hdu(KIND_FRAMES, system, info.simulated, False, origin)
     region = settings.region
     cards = {
-        "CAMERA": (fits_file.header_text(info.model), "camera"),
-        "SERIAL": (fits_file.header_text(info.serial), "its serial number"),
+        "CAMERA": (info.model, "camera"),
+        "SERIAL": (info.serial, "its serial number"),
         "EXPTIME": (settings.exposure_s, "exposure, s"),
         "RATE": (settings.frame_rate_hz, "frames per second, Hz"),
         "GAINDB": (settings.gain_db, "analogue gain, dB"),
         "REGX": (region.x, "first column of the region"),
         "REGY": (region.y, "first row of the region"),
     }
-    for key, value in cards.items():
-        primary.header[key] = value
     rows = [(frame.index, frame.exposed_ns, frame.arrived_ns, frame.n_saturated) for frame in frames]
     columns = dict(zip(_COLUMNS, np.array(rows, np.int64).T, strict=True))
     hdus = [
-        primary,
         fits_file.image_extension("FRAMES", np.stack([frame.data for frame in frames]), "count"),
         fits_file.table_extension("TIMES", columns),
-        fits_file.text_extension("CONFIG", origin.config_text),
     ]
-    fits_file.write(path, hdus)
-    return path
+    return fits_file.write_product(path, KIND_FRAMES, hdus, system, info.simulated, origin, cards=cards)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -82,10 +75,6 @@ class RecordedFrames:
         Monotonic time of the end of each exposure and of its arrival ``(n_frames,)``, nanoseconds.
     n_saturated
         Pixels at the top of the scale ``(n_frames,)``.
-    camera, serial
-        What took them.
-    settings
-        As they were in force.
     """
 
     data: NDArray[np.uint16]

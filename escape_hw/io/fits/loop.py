@@ -13,11 +13,15 @@ from escape_hw.api.results import Estimate, LoopResult, StrehlEstimate
 from escape_hw.io.fits import extensions as fits_parts
 from escape_hw.io.fits import file as fits_file
 from escape_hw.io.fits.file import Product
-from escape_hw.io.fits.matrix import partial_path
 from escape_hw.io.provenance import Provenance
 
 KIND_PSF = "PSF"
 _STREHL_METHODS = ("peak", "otf", "encircled")
+#: Scalars of the extension RUN.
+_SCALARS = {
+    "gain": float, "leak": float, "dropped_modes": int, "frames": int, "lost_frames": int, "rate_hz": float,
+    "residual_rms_nm": float,
+}  # fmt: skip
 _IMAGES = {
     "psf": ("PSF", np.float32, "count"),
     "model_psf": ("MODEL", np.float32, "count"),
@@ -47,26 +51,9 @@ def save_loop(
     StorageError
         The file cannot be written; no partial file remains.
     """
-    origin = origin or Provenance()
-    if result.partial:
-        path = partial_path(path)
-    primary = fits_file.primary_hdu(KIND_PSF, system, simulated, result.partial, origin)
-    primary.header["METHOD"] = (fits_file.header_text(result.method), "the matrix that closed the loop")
-    primary.header["STABLE"] = (bool(result.stable), "the loop stayed stable")
-    run = {
-        name: getattr(result, name)
-        for name in ("gain", "leak", "dropped_modes", "frames", "lost_frames", "rate_hz", "residual_rms_nm")
-    }
-    run |= {
-        "gain_sigma": result.gain_sigma,
-        "latency_us": dict(result.latency_us),
-        "notes": list(result.notes),
-    }
-    hdus = [
-        primary,
-        fits_parts.pack_metrics(run, "RUN"),
-        fits_file.text_extension("CONFIG", origin.config_text),
-    ]
+    run = {name: getattr(result, name) for name in (*_SCALARS, "gain_sigma")}
+    run |= {"latency_us": dict(result.latency_us), "notes": list(result.notes)}
+    hdus = [fits_parts.pack_metrics(run, "RUN")]
     for name, (extension, dtype, unit) in _IMAGES.items():
         data = getattr(result, name)
         if data is not None and data.size:
@@ -79,8 +66,13 @@ def save_loop(
             "SIGMA": np.array([row.sigma for row in rows], float),
         }
         hdus.append(fits_file.table_extension("STREHL", columns))
-    fits_file.write(path, hdus)
-    return path
+    cards = {
+        "METHOD": (result.method, "the matrix that closed the loop"),
+        "STABLE": (bool(result.stable), "the loop stayed stable"),
+    }
+    return fits_file.write_product(
+        path, KIND_PSF, hdus, system, simulated, origin, partial=result.partial, cards=cards
+    )
 
 
 def load_loop(path: Path | str) -> LoopProduct:
@@ -96,7 +88,8 @@ def load_loop(path: Path | str) -> LoopProduct:
 
 def _unpack(path: Path, hdus: astropy_fits.HDUList, header: dict[str, Any]) -> LoopResult:
     run = fits_parts.unpack_metrics(path, hdus, "RUN")
-    images = {
+    fields: dict[str, Any] = {name: kind(run[name]) for name, kind in _SCALARS.items()}
+    fields |= {
         name: fits_file.read_array(path, hdus, extension, dtype)
         for name, (extension, dtype, _unit) in _IMAGES.items()
         if extension in hdus
@@ -108,18 +101,11 @@ def _unpack(path: Path, hdus: astropy_fits.HDUList, header: dict[str, Any]) -> L
         strehl = StrehlEstimate(*(Estimate(float(value), float(sigma)) for value, sigma in values))
     return LoopResult(
         method=str(header["METHOD"]),
-        gain=float(run["gain"]),
-        leak=float(run["leak"]),
-        dropped_modes=int(run["dropped_modes"]),
-        frames=int(run["frames"]),
-        lost_frames=int(run["lost_frames"]),
-        rate_hz=float(run["rate_hz"]),
         stable=bool(header["STABLE"]),
-        residual_rms_nm=float(run["residual_rms_nm"]),
         strehl=strehl,
         latency_us={str(name): float(value) for name, value in run["latency_us"].items()},
         partial=header["FINISH"] == "aborted",
         notes=tuple(str(note) for note in run["notes"]),
         gain_sigma=run.get("gain_sigma"),
-        **images,
+        **fields,
     )

@@ -42,22 +42,10 @@ class MatrixProduct(Product[CalibrationResult]):
         return self.result.registration
 
 
-def partial_path(path: Path) -> Path:
-    """The name under which an aborted run keeps what it measured: ``im.partial.fits``."""
-    return path if path.name.endswith(".partial.fits") else path.with_suffix(".partial.fits")
-
-
 def save_matrix(path: Path | str, result: CalibrationResult, origin: Provenance | None = None) -> Path:
     """Write a calibration's matrix with grid, errors, basis, registration and configuration.
 
-    Parameters
-    ----------
-    path
-        File name; the result of an aborted run is written as ``*.partial.fits``.
-    result
-        What a calibration procedure returned.
-    origin
-        Where it comes from.
+    The result of an aborted run is written as ``*.partial.fits``.
 
     Returns
     -------
@@ -71,26 +59,16 @@ def save_matrix(path: Path | str, result: CalibrationResult, origin: Provenance 
     ValueError
         Matrix and grid do not belong together.
     """
-    path, origin = Path(path), origin or Provenance()
     matrix = result.matrix
     if not np.array_equal(matrix.valid, result.grid.valid):
         raise ValueError(f"the matrix and the geometry mark different {result.grid.elements} as valid")
-    if result.partial:
-        path = partial_path(path)
-    primary = fits_file.primary_hdu(KIND_MATRIX, matrix.system, matrix.simulated, result.partial, origin)
-    primary.header["METHOD"] = (fits_file.header_text(matrix.method), "how the matrix was made")
-    primary.header["FRAMES"] = (int(result.frames), "frames used")
-    primary.header["LOST"] = (int(result.lost_frames), "frames lost")
     hdus = [
-        primary,
         *_pack_matrix(matrix, ""),
         fits_file.image_extension("M2C", matrix.m2c.astype(np.float64)),
-        fits_file.image_extension("VALID", matrix.valid),
         *extensions.pack_grid(result.grid),
         extensions.pack_metrics(
             {"sky_seconds": float(result.sky_seconds), "notes": list(result.notes)}, "RUN"
         ),
-        fits_file.text_extension("CONFIG", origin.config_text),
     ]
     if result.measured is not None:
         hdus += _pack_matrix(result.measured, "MEAS_")
@@ -100,8 +78,15 @@ def save_matrix(path: Path | str, result: CalibrationResult, origin: Provenance 
         hdus.append(extensions.pack_response(result.response))
     if result.mean_frame is not None:
         hdus.append(fits_file.image_extension("FRAME", result.mean_frame.astype(np.float32), "count"))
-    fits_file.write(path, hdus)
-    return path
+    cards = {
+        "METHOD": (matrix.method, "how the matrix was made"),
+        "FRAMES": (int(result.frames), "frames used"),
+        "LOST": (int(result.lost_frames), "frames lost"),
+    }
+    return fits_file.write_product(
+        Path(path), KIND_MATRIX, hdus, matrix.system, matrix.simulated, origin, partial=result.partial,
+        cards=cards,
+    )  # fmt: skip
 
 
 def load_matrix(
@@ -137,20 +122,18 @@ def load_matrix(
         Sound, but not for this system, basis, mirror or mode.
     """
     product = MatrixProduct.read(path, KIND_MATRIX, _unpack)
-    path, header = product.path, product.header
-    matrix = product.matrix
-    _expect(
-        path,
-        "system",
-        header["SYSTEM"],
-        None if expect_system is None else fits_file.header_text(expect_system),
-    )
-    _expect(path, "kind of sensor", product.grid.kind, expect_sensor)
-    _expect(path, "kind of basis", header["BASIS"], expect_basis)
-    _expect(path, "number of actuators", matrix.m2c.shape[0], expect_actuators)
+    path, header, matrix = product.path, product.header, product.matrix
+    system = None if expect_system is None else fits_file.header_text(expect_system)
     remedy = f"basis.n_modes={matrix.n_modes} would take this one"
-    _expect(path, "number of modes", matrix.n_modes, expect_modes, remedy)
-    _expect(path, "grid of sub-apertures", matrix.valid.shape, expect_sub_apertures)
+    for what, found, wanted, hint in (
+        ("system", header["SYSTEM"], system, ""),
+        ("kind of sensor", product.grid.kind, expect_sensor, ""),
+        ("kind of basis", header["BASIS"], expect_basis, ""),
+        ("number of actuators", matrix.m2c.shape[0], expect_actuators, ""),
+        ("number of modes", matrix.n_modes, expect_modes, remedy),
+        ("grid of sub-apertures", matrix.valid.shape, expect_sub_apertures, ""),
+    ):
+        _expect(path, what, found, wanted, hint)
     if expect_m2c is not None:
         _expect_basis(path, matrix.m2c, np.asarray(expect_m2c, float))
     if matrix.simulated and not allow_simulated:

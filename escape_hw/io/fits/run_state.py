@@ -70,7 +70,7 @@ def save_state(path: Path, state: RunState, system: str, simulated: bool) -> Non
         ),
     ]
     if state.grid is not None:
-        hdus += [fits_file.image_extension("VALID", state.grid.valid), *fits_geometry.pack_grid(state.grid)]
+        hdus += fits_geometry.pack_grid(state.grid)
     fits_file.write(path, hdus)
 
 

@@ -16,6 +16,13 @@ from escape_hw.io.fits.file import Product
 from escape_hw.io.provenance import Provenance
 
 KIND_TELEMETRY = "TELEM"
+#: Extension, type and unit of every part.
+_PARTS = {
+    "index": ("INDEX", np.int64, ""),
+    "exposed_s": ("EXPOSED", np.float64, "s"),
+    "slopes": ("SLOPES", np.float32, ""),
+    "commands": ("COMMANDS", np.float64, ""),
+}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -72,17 +79,11 @@ def save_telemetry(
     StorageError
         The file cannot be written; no partial file remains.
     """
-    origin = origin or Provenance()
     hdus = [
-        fits_file.primary_hdu(KIND_TELEMETRY, system, simulated, False, origin),
-        fits_file.text_extension("CONFIG", origin.config_text),
-        fits_file.image_extension("INDEX", record.index.astype(np.int64)),
-        fits_file.image_extension("EXPOSED", record.exposed_s.astype(np.float64), "s"),
-        fits_file.image_extension("SLOPES", record.slopes.astype(np.float32)),
-        fits_file.image_extension("COMMANDS", record.commands.astype(np.float64)),
+        fits_file.image_extension(extension, getattr(record, name).astype(dtype), unit)
+        for name, (extension, dtype, unit) in _PARTS.items()
     ]
-    fits_file.write(path, hdus)
-    return path
+    return fits_file.write_product(path, KIND_TELEMETRY, hdus, system, simulated, origin)
 
 
 def load_telemetry(path: Path | str) -> TelemetryProduct:
@@ -98,8 +99,8 @@ def load_telemetry(path: Path | str) -> TelemetryProduct:
 
 def _unpack(path: Path, hdus: astropy_fits.HDUList, header: dict[str, Any]) -> LoopTelemetry:
     return LoopTelemetry(
-        fits_file.read_array(path, hdus, "INDEX", np.int64),
-        fits_file.read_array(path, hdus, "EXPOSED", np.float64),
-        fits_file.read_array(path, hdus, "SLOPES", np.float32),
-        fits_file.read_array(path, hdus, "COMMANDS", np.float64),
+        **{
+            name: fits_file.read_array(path, hdus, extension, dtype)
+            for name, (extension, dtype, _) in _PARTS.items()
+        }
     )

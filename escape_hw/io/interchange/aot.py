@@ -19,51 +19,13 @@ from escape_hw.api.sensor import SensorGeometry, SubApertureGrid, require_kind
 from escape_hw.errors import IncompatibleProduct, ProductError
 from escape_hw.io.documents import registration_document
 from escape_hw.io.fits import file as fits_file
+from escape_hw.io.fits.extensions import geometry_cards, geometry_fields, reference_slopes
 from escape_hw.io.fits.telemetry import LoopTelemetry
 from escape_hw.io.interchange.optional_packages import import_optional
 from escape_hw.io.storage import make_folder, storage_error, write_atomic
 
 
-def number_mask(valid: NDArray[np.bool_]) -> NDArray[np.int32]:
-    """The mask in AOT form: the number of each valid sub-aperture, -1 elsewhere."""
-    mask = np.full(valid.shape, -1, np.int32)
-    mask[valid] = np.arange(int(valid.sum()))
-    return mask
-
-
-def read_mask(mask: NDArray[np.integer]) -> tuple[NDArray[np.bool_], NDArray[np.intp]]:
-    """Valid sub-apertures of a numbered mask, and their numbers row by row, which is our order."""
-    valid = np.asarray(mask) >= 0
-    return valid, np.asarray(mask)[valid].astype(np.intp)
-
-
-def geometry_metadata(geometry: SensorGeometry) -> dict[str, float | str]:
-    """What the standard has no place for, by keyword."""
-    metadata: dict[str, float | str] = {
-        "COUNTS": float(geometry.counts),
-        "BACKGND": float(geometry.background),
-    }
-    if isinstance(geometry, PyramidPupils):
-        metadata |= {
-            "DIAMETER": float(geometry.diameter_px),
-            "MOTION": float(geometry.motion),
-            "CENTRESD": float(geometry.centre_sigma_px),
-            "NORMAL": geometry.normalisation,
-            "MODULAT": float(geometry.modulation),
-        }
-        for k, (x, y) in enumerate(geometry.centres_px):
-            metadata |= {f"CENTREX{k}": float(x), f"CENTREY{k}": float(y)}
-        return metadata
-    grid = require_kind(geometry, SubApertureGrid)
-    return metadata | {
-        "ORIGINX": float(grid.origin_px[0]),
-        "ORIGINY": float(grid.origin_px[1]),
-        "MOTION": float(grid.motion_px),
-        "AIR": float(grid.turbulence_px),
-    }
-
-
-def mask_corners(geometry: SensorGeometry) -> list[tuple[float, float]]:
+def _mask_corners(geometry: SensorGeometry) -> list[tuple[float, float]]:
     """Lowest (x, y) that each mask occupies on the detector, pixels from its first pixel's edge."""
     if isinstance(geometry, PyramidPupils):
         return [(float(x), float(y)) for x, y in geometry.corners_px]
@@ -71,86 +33,41 @@ def mask_corners(geometry: SensorGeometry) -> list[tuple[float, float]]:
     return [(grid.origin_px[0] - (grid.pitch_px - 1) / 2, grid.origin_px[1] - (grid.pitch_px - 1) / 2)]
 
 
-def subaperture_size_px(geometry: SensorGeometry) -> float:
-    """Size of a sub-aperture in detector pixels."""
-    return (
-        1.0
-        if isinstance(geometry, PyramidPupils)
-        else float(require_kind(geometry, SubApertureGrid).pitch_px)
-    )
+def _mask_metadata(geometry: SensorGeometry) -> dict[str, float | str]:
+    """What the standard has no place for, by keyword."""
+    metadata = geometry_cards(geometry)
+    if isinstance(geometry, PyramidPupils):
+        for k, (x, y) in enumerate(geometry.centres_px):
+            metadata |= {f"CENTREX{k}": float(x), f"CENTREY{k}": float(y)}
+    return metadata
 
 
-def build_lenslet_grid(
-    valid: NDArray[np.bool_],
-    references: NDArray[np.float32],
-    flux: NDArray[np.float32],
-    corners: list[tuple[float, float]],
-    size: float,
-    metadata: dict[str, Any],
+def _build_lenslet_grid(
+    parts: dict[str, Any], corners: list[tuple[float, float]], size: float, metadata: dict[str, Any]
 ) -> SubApertureGrid:
-    """A lenslet grid from the standard's parts.
-
-    Parameters
-    ----------
-    valid, flux
-        Mask and relative light ``(n_rows, n_columns)``.
-    references
-        ``(n_valid, 2)`` as (x, y), pixels.
-    corners, size
-        As :func:`mask_corners` and :func:`subaperture_size_px` give them.
-    facts
-        Metadata of the mask, written by ESCAPE only.
-    """
+    """A lenslet grid from the standard's parts; ``metadata`` of the mask is written by ESCAPE only."""
     x, y = corners[0] if corners else (0.0, 0.0)
     half = (size - 1) / 2
-    return SubApertureGrid(
-        pitch_px=size,
-        origin_px=(float(metadata.get("ORIGINX", x + half)), float(metadata.get("ORIGINY", y + half))),
-        valid=valid,
-        references_px=references,
-        flux=flux,
-        counts=float(metadata.get("COUNTS", 0.0)),
-        motion_px=float(metadata.get("MOTION", 0.0)),
-        turbulence_px=float(metadata.get("AIR", 0.0)),
-        background=float(metadata.get("BACKGND", 0.0)),
-    )
+    origin = (float(metadata.get("ORIGINX", x + half)), float(metadata.get("ORIGINY", y + half)))
+    fields = geometry_fields(SubApertureGrid.kind, metadata) | {"pitch_px": size}
+    fields |= {"valid": parts["valid"], "references_px": parts["references"], "flux": parts["flux"]}
+    return SubApertureGrid(origin_px=origin, **fields)
 
 
-def build_pyramid_pupils(
-    valid: NDArray[np.bool_],
-    references: NDArray[np.float32],
-    flux: NDArray[np.float32],
-    corners: list[tuple[float, float]],
-    metadata: dict[str, Any],
+def _build_pyramid_pupils(
+    parts: dict[str, Any], corners: list[tuple[float, float]], metadata: dict[str, Any]
 ) -> PyramidPupils:
-    """The images of a pyramid from the standard's parts; see :func:`build_lenslet_grid`.
-
-    Raises
-    ------
-    IncompatibleProduct
-        There are not four masks.
-    """
+    """The images of a pyramid from the standard's parts; see :func:`_build_lenslet_grid`."""
     if len(corners) != 4:
         raise IncompatibleProduct(f"the pyramid has {len(corners)} masks on its detector; ours has four")
     at = np.array(corners, float)
-    n = valid.shape[0]
+    n = parts["valid"].shape[0]
     centres = at + (n - 1) / 2
     for k in range(4):
         centres[k] = (metadata.get(f"CENTREX{k}", centres[k, 0]), metadata.get(f"CENTREY{k}", centres[k, 1]))
-    return PyramidPupils(
-        centres_px=centres,
-        diameter_px=float(metadata.get("DIAMETER") or n),
-        corners_px=np.round(at).astype(np.intp),
-        valid=valid,
-        references=references,
-        flux=flux,
-        counts=float(metadata.get("COUNTS", 0.0)),
-        motion=float(metadata.get("MOTION", 0.0)),
-        background=float(metadata.get("BACKGND", 0.0)),
-        normalisation=str(metadata.get("NORMAL", "global")),
-        modulation=float(metadata.get("MODULAT", 0.0)),
-        centre_sigma_px=float(metadata.get("CENTRESD", 0.0)),
-    )
+    fields = geometry_fields(PyramidPupils.kind, metadata)
+    fields["diameter_px"] = fields.get("diameter_px") or float(n)
+    return PyramidPupils(centres_px=centres, corners_px=np.round(at).astype(np.intp), **parts, **fields)
 
 
 #: Names of the parts in the file.
@@ -199,10 +116,6 @@ def write_aot(
     ----------
     path
         A name that ends in ``.fits``.
-    result
-        The calibration.
-    facts
-        Of the system.
     telemetry
         Of a loop on the same sensor geometry.
     config_text
@@ -220,9 +133,8 @@ def write_aot(
     aotpy = import_optional("aotpy", "Writing AOT files")
     matrix = result.matrix
     if telemetry is not None:
-        wanted, found = (matrix.n_slopes, matrix.m2c.shape[0]), (
-            telemetry.slopes.shape[1], telemetry.commands.shape[1],
-        )  # fmt: skip
+        wanted = (matrix.n_slopes, matrix.m2c.shape[0])
+        found = (telemetry.slopes.shape[1], telemetry.commands.shape[1])
         if wanted != found:
             raise IncompatibleProduct(
                 f"the telemetry has {found[0]} slopes and {found[1]} actuators, the matrix {wanted[0]} and "
@@ -250,13 +162,18 @@ class _AotWriter:
         self, aotpy: Any, result: CalibrationResult, facts: AotSystem, telemetry: LoopTelemetry | None
     ) -> None:
         self.aotpy, self.result, self.facts, self.telemetry = aotpy, result, facts, telemetry
+        if telemetry is not None:
+            # The same object for all parts that share it.
+            self.time = aotpy.Time(
+                uid="FRAMES", timestamps=telemetry.exposed_s.tolist(), frame_numbers=telemetry.index.tolist()
+            )
 
     def image(
-        self, name: str, data: Any, unit: str | None = None, facts: Mapping[str, Any] | None = None
+        self, name: str, data: Any, unit: str | None = None, metadata: Mapping[str, Any] | None = None
     ) -> Any:
-        """Data with a name that must be its own, and metadata by keyword."""
-        metadata = [self.aotpy.Metadatum(key, value) for key, value in (facts or {}).items()]
-        return self.aotpy.Image(name, np.ascontiguousarray(data), unit, metadata=metadata)
+        """Data with a unique name, and metadata by keyword."""
+        items = [self.aotpy.Metadatum(key, value) for key, value in (metadata or {}).items()]
+        return self.aotpy.Image(name, np.ascontiguousarray(data), unit, metadata=items)
 
     def system(self) -> Any:
         """The whole system."""
@@ -305,18 +222,18 @@ class _AotWriter:
     def sensor(self, star: Any) -> Any:
         """The wavefront sensor, with its measurements."""
         a, grid = self.aotpy, self.result.grid
-        references = np.asarray(getattr(grid, "references_px", getattr(grid, "references", None)), np.float32)
+        # The mask in AOT form: the number of each valid sub-aperture, -1 elsewhere.
+        mask = np.full(grid.valid.shape, -1, np.int32)
+        mask[grid.valid] = np.arange(grid.n_valid)
         unit = "pix" if self.result.matrix.slope_unit == "pixel" else None
         common = {
             "uid": SENSOR,
             "source": star,
             "n_valid_subapertures": grid.n_valid,
-            "ref_measurements": self.image("REFERENCES", references.T, unit),
-            "subaperture_mask": self.image(
-                "SUBAPERTURES", number_mask(grid.valid), facts=geometry_metadata(grid)
-            ),
-            "mask_offsets": [a.Coordinates(x, y) for x, y in mask_corners(grid)],
-            "subaperture_size": subaperture_size_px(grid),
+            "ref_measurements": self.image("REFERENCES", reference_slopes(grid).T, unit),
+            "subaperture_mask": self.image("SUBAPERTURES", mask, metadata=_mask_metadata(grid)),
+            "mask_offsets": [a.Coordinates(x, y) for x, y in _mask_corners(grid)],
+            "subaperture_size": float(grid.pitch_px) if isinstance(grid, SubApertureGrid) else 1.0,
             "subaperture_intensities": self.image("FLUX", grid.flux[grid.valid][None].astype(np.float32)),
             "wavelength": self.facts.wavelength_m,
             "detector": a.Detector(uid="WFS CAMERA", frame_rate=self.facts.frame_rate_hz),
@@ -324,7 +241,7 @@ class _AotWriter:
         if self.telemetry is not None:
             slopes = self.telemetry.slopes.reshape(len(self.telemetry.slopes), 2, -1)
             common["measurements"] = self.image("SLOPES", slopes, unit)
-            common["measurements"].time = self.time()
+            common["measurements"].time = self.time
         if isinstance(grid, PyramidPupils):
             return a.Pyramid(n_sides=4, dimensions=2, **common)
         return a.ShackHartmann(centroiding_algorithm="thresholded centre of gravity", **common)
@@ -332,42 +249,27 @@ class _AotWriter:
     def loops(self, sensor: Any, mirror: Any) -> list[Any]:
         """The loop with the matrix, and the one that holds its standard errors."""
         a, matrix, response = self.aotpy, self.result.matrix, self.result.response
-        modes = self.image("MODES", matrix.m2c * self.facts.stroke_m, "m")
+        shared = {
+            "commanded_corrector": mirror,
+            "input_sensor": sensor,
+            "modes_to_commands": self.image("MODES", matrix.m2c * self.facts.stroke_m, "m"),
+        }
         loop = a.ControlLoop(
             uid=LOOP,
-            commanded_corrector=mirror,
-            input_sensor=sensor,
             closed=self.telemetry is not None,
             framerate=self.facts.frame_rate_hz,
-            delay=None if response is None else float(response.delay),
-            modes_to_commands=modes,
+            delay=None if response is None else float(response.delay_frames),
             modes_to_measurements=self.image("MATRIX", _to_cube(matrix.data), matrix.slope_unit),
+            **shared,
         )
         if self.telemetry is not None:
-            loop.time = self.time()
+            loop.time = self.time
             commands = self.telemetry.commands * self.facts.stroke_m
             loop.commands = self.image("COMMANDS", commands, "m")
             loop.commands.time = loop.time
-        errors = a.ControlLoop(
-            uid=ERRORS,
-            commanded_corrector=mirror,
-            input_sensor=sensor,
-            closed=False,
-            modes_to_commands=modes,
-            modes_to_measurements=self.image("MATRIX ERRORS", _to_cube(matrix.sigma), matrix.slope_unit),
-        )
+        sigma = self.image("MATRIX ERRORS", _to_cube(matrix.sigma), matrix.slope_unit)
+        errors = a.ControlLoop(uid=ERRORS, closed=False, modes_to_measurements=sigma, **shared)
         return [loop, errors]
-
-    def time(self) -> Any:
-        """Times and numbers of the frames; the same object for all that share them."""
-        record = self.telemetry
-        if record is not None and not hasattr(self, "_time"):
-            self._time = self.aotpy.Time(
-                uid="FRAMES",
-                timestamps=record.exposed_s.tolist(),
-                frame_numbers=record.index.tolist(),
-            )
-        return getattr(self, "_time", None)
 
 
 def _to_cube(rows: Any) -> Any:
@@ -379,18 +281,7 @@ def _to_cube(rows: Any) -> Any:
 class AotContent:
     """Contents of an AOT file for one loop.
 
-    Parameters
-    ----------
-    system
-        Name of the system, as the file gives it.
-    geometry
-        Of the sensor.
-    calibration
-        The matrix with its modes, where the file has one.
-    telemetry
-        Slopes and commands, where it has both.
-    config_text
-        The configuration it carries.
+    ``calibration`` is the matrix with its modes, ``telemetry`` slopes and commands, where the file has them.
     """
 
     system: str
@@ -405,8 +296,6 @@ def read_aot(path: Path | str, stroke_m: float | None = None, loop: str = "") ->
 
     Parameters
     ----------
-    path
-        The file.
     stroke_m
         Metres of surface for a command of 1; the file's own by default.
     loop
@@ -454,7 +343,12 @@ class _AotReader:
         self.sensor, self.mirror = loop.input_sensor, loop.commanded_corrector
         self.keywords = {one.key: one.value for one in system.metadata}
         self.stroke_m = stroke_m or getattr(self.mirror, "stroke", None)
-        self.valid, self.order = self._mask()
+        if self.sensor.subaperture_mask is None:
+            raise self._incompatible("its sensor has no mask of sub-apertures")
+        numbers = np.asarray(self.sensor.subaperture_mask.data)
+        self.valid = numbers >= 0
+        # The numbers of the sub-apertures row by row, which is our order.
+        self.order = numbers[self.valid].astype(np.intp)
 
     def content(self) -> AotContent:
         """Everything."""
@@ -474,12 +368,6 @@ class _AotReader:
             )
         return float(self.stroke_m)
 
-    def _mask(self) -> tuple[NDArray[np.bool_], NDArray[np.intp]]:
-        image = self.sensor.subaperture_mask
-        if image is None:
-            raise self._incompatible("its sensor has no mask of sub-apertures")
-        return read_mask(image.data)
-
     def _geometry(self) -> SensorGeometry:
         sensor, n = self.sensor, int(self.valid.sum())
         if sensor.dimensions != 2:
@@ -493,12 +381,12 @@ class _AotReader:
         if sensor.subaperture_intensities is not None:
             light = np.asarray(sensor.subaperture_intensities.data, float).reshape(-1, n).mean(axis=0)
             flux[self.valid] = light[self.order] / max(float(light.max()), 1e-30)
-        facts = {one.key: one.value for one in sensor.subaperture_mask.metadata}
+        metadata = {one.key: one.value for one in sensor.subaperture_mask.metadata}
         corners = [(float(at.x or 0), float(at.y or 0)) for at in sensor.mask_offsets]
+        parts = {"valid": self.valid, "references": references, "flux": flux}
         if isinstance(sensor, self.aotpy.Pyramid):
-            return build_pyramid_pupils(self.valid, references, flux, corners, facts)
-        size = float(sensor.subaperture_size or 1.0)
-        return build_lenslet_grid(self.valid, references, flux, corners, size, facts)
+            return _build_pyramid_pupils(parts, corners, metadata)
+        return _build_lenslet_grid(parts, corners, float(sensor.subaperture_size or 1.0), metadata)
 
     def _rows(self, cube: NDArray[Any]) -> NDArray[np.float32]:
         """``(n_valid, 2, n_modes)`` of the standard as our rows."""

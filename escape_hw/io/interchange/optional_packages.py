@@ -12,14 +12,7 @@ _INDEX_NAMES = {"yaml": "PyYAML", "pyrtc": "pyrtcao"}
 
 
 def import_optional(name: str, purpose: str) -> Any:
-    """An optional package.
-
-    Parameters
-    ----------
-    name
-        Import name.
-    purpose
-        What it is needed for, as the beginning of a sentence.
+    """Import an optional package; ``purpose`` begins the sentence that says what it is needed for.
 
     Raises
     ------

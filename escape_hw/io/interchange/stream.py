@@ -10,16 +10,10 @@ from numpy.typing import DTypeLike, NDArray
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Publication:
-    """One array of a stream.
+    """One array of a stream, a copy.
 
-    Parameters
-    ----------
-    data
-        A copy with the stream's shape and type.
-    count
-        Number of the write, which rises by one with each.
-    written_ns
-        When it was written, Unix time in nanoseconds; 0 if the stream does not record it.
+    ``count`` is the number of the write, which rises by one with each; ``written_ns`` its Unix time in
+    nanoseconds, 0 if the stream does not record it.
     """
 
     data: NDArray[Any]
@@ -55,24 +49,17 @@ class Stream(Protocol):
 
         Raises
         ------
-        StreamLost
+        StreamReadError
             Its writer died halfway through it.
         """
         ...
 
     def read_after(self, count: int, timeout_s: float) -> Publication | None:
-        """The newest array once it is newer than a write; ``None`` when none is in time.
-
-        Parameters
-        ----------
-        count
-            Number of that write.
-        timeout_s
-            Longest wait in seconds; 0: do not wait.
+        """The newest array once it is newer than write number ``count``; ``None`` after a time limit.
 
         Raises
         ------
-        StreamLost
+        StreamReadError
             Its writer died halfway through it.
         """
         ...

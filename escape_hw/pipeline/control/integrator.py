@@ -1,8 +1,6 @@
-"""Protocol of modal controllers, the leaky integrator and its stability limit."""
+"""The leaky integrator and its stability limit."""
 
 from __future__ import annotations
-
-from typing import Protocol
 
 import numpy as np
 from numba import njit
@@ -11,39 +9,17 @@ from numpy.typing import NDArray
 from escape_hw.pipeline.control.matrix_products import PACKING_BYTES, PackedMatrix
 
 
-class Controller(Protocol):
-    """Modal controller: computes a modal command from the slopes of each frame."""
-
-    @property
-    def residual(self) -> NDArray[np.float32]:
-        """Reconstructed wavefront of the last frame ``(n_modes,)``."""
-        ...
-
-    def __call__(self, slopes: NDArray[np.float32]) -> NDArray[np.floating]:
-        """Modal command ``(n_modes,)`` for slopes ``(n_slopes,)``; the same array at every call."""
-        ...
-
-    def set_applied(self, modes: NDArray[np.floating]) -> None:
-        """Set the state to the command that the mirror executed ``(n_modes,)``."""
-        ...
-
-    def reset(self) -> None:
-        """Set the state to zero."""
-        ...
+@njit(cache=True, nogil=True)
+def _integrate(retention, gains, residual, state):  # type: ignore[no-untyped-def]  # pragma: no cover
+    for k in range(state.size):
+        state[k] = retention * state[k] - gains[k] * residual[k]
 
 
 @njit(cache=True, nogil=True)
 def _step(matrix, slopes, retention, gains, residual, state):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Reconstruct and integrate; compiled as a whole because calls dominate in small systems."""
     np.dot(matrix, slopes, residual)
-    for k in range(state.size):
-        state[k] = retention * state[k] - gains[k] * residual[k]
-
-
-@njit(cache=True, nogil=True)
-def _integrate(retention, gains, residual, state):  # type: ignore[no-untyped-def]  # pragma: no cover
-    for k in range(state.size):
-        state[k] = retention * state[k] - gains[k] * residual[k]
+    _integrate(retention, gains, residual, state)
 
 
 def gain_limit(delay_frames: float) -> float:
@@ -52,10 +28,7 @@ def gain_limit(delay_frames: float) -> float:
     ``2 sin(pi / (2 (2 d - 1)))``, from the phase margin of ``c[k] = c[k-1] - g c[k-d]``; exact for whole
     delays (2 for one frame, 1 for two).
 
-    Parameters
-    ----------
-    delay_frames
-        Frames from a command to the slopes that show it, at least 1.
+    ``delay_frames``: frames from a command to the slopes that show it, at least 1.
     """
     d = max(delay_frames, 1.0)
     return float(2 * np.sin(np.pi / (2 * (2 * d - 1))))

@@ -33,12 +33,7 @@ class PackedMatrix:
     each element is at most 1/65534 of the largest in its row; the relative error of a reconstructed mode is
     about 1e-4, far below the noise of the slopes.
 
-    Parameters
-    ----------
-    mantissa
-        ``(rows, columns)``, int16.
-    scale
-        ``(rows,)``, float32.
+    ``mantissa``: ``(rows, columns)``, int16; ``scale``: ``(rows,)``, float32.
     """
 
     mantissa: NDArray[np.int16]

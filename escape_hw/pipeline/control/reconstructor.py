@@ -13,12 +13,10 @@ def reconstructor(
     *,
     scale: NDArray[np.floating] | None = None,
     dropped_modes: int = 0,
-    regularisation: float = 0.0,
 ) -> NDArray[np.float32]:
-    """Pseudo-inverse by singular values, truncated or with Tikhonov regularisation.
+    """Truncated pseudo-inverse ``R = V Sigma^+(phi) U^T`` (paper) with the ``phi`` largest singular values.
 
-    ``R = V Sigma^+(phi) U^T`` (paper) with the ``phi`` largest singular values, where
-    ``sigma^+ = sigma / (sigma^2 + lambda^2)``.
+    Returns ``(n_modes, n_slopes)``, float32.
 
     Parameters
     ----------
@@ -29,12 +27,6 @@ def reconstructor(
         per stroke, so that the weakest eigenmodes need most stroke for least signal.
     dropped_modes
         Number of the weakest eigenmodes that are left out.
-    regularisation
-        lambda relative to the largest singular value; 0 for none.
-
-    Returns
-    -------
-    ndarray of float32, ``(n_modes, n_slopes)``
 
     Raises
     ------
@@ -54,5 +46,5 @@ def reconstructor(
             f"the interaction matrix is singular: eigenmode {s[kept].size} has no signal; "
             "drop more modes or measure it again"
         )
-    inverse = s[kept] / (s[kept] ** 2 + (regularisation * s[0]) ** 2)
+    inverse = s[kept] / s[kept] ** 2
     return np.ascontiguousarray((vt[kept].T * inverse) @ u[:, kept].T / stroke[:, None], dtype=np.float32)

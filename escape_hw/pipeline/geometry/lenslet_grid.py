@@ -129,10 +129,6 @@ def find_lenslet_grid(
         ``"lattice"``: the lattice points (without a source); ``"mean"``: the mean spot positions (with a
         source).
 
-    Returns
-    -------
-    SubApertureGrid
-
     Raises
     ------
     CalibrationError

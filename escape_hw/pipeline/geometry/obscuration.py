@@ -36,10 +36,6 @@ def transmitted_fraction(
 
     Parameters
     ----------
-    telescope
-        Obscuration and vanes.
-    diameter_m
-        Diameter of the pupil in metres.
     x_m, y_m
         Coordinates of the samples along either axis in metres, evenly spaced; ``y_m`` as ``x_m`` by
         default.
@@ -62,15 +58,7 @@ def _subsample(at: NDArray[np.float64], alone: float, points: int) -> NDArray[np
 
 
 def build_shadow(telescope: TelescopeSection, diameter_m: float) -> Shadow | None:
-    """Build the transmission of a telescope's obscuration and vanes; ``None`` without an obscuration.
-
-    Parameters
-    ----------
-    telescope
-        Obscuration and vanes.
-    diameter_m
-        Diameter of the pupil in metres.
-    """
+    """Build the transmission of a telescope's obscuration and vanes; ``None`` without an obscuration."""
     if not telescope.obscuration:
         return None
 

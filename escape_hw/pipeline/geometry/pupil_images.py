@@ -72,10 +72,6 @@ def find_pupil_images(
         ``"mean"``: the mean slopes (with a source); ``"design"``: the mean slopes without their smooth part
         (without a source; see :func:`~escape_hw.api.pyramid.remove_low_orders`).
 
-    Returns
-    -------
-    PyramidPupils
-
     Raises
     ------
     CalibrationError
@@ -127,8 +123,6 @@ def refine_pupil_images(
     means
         Means of equally many frames in counts ``(rows, columns)``, background subtracted, in order of time.
         Their scatter gives the error.
-    pupils
-        Pupil images as found before.
     shadow
         Transmission of the telescope's obscuration and vanes; ``None`` without them.
     """

@@ -100,12 +100,7 @@ def estimate_roundness_error(
     harmonic, which is taken for a shift, is assumed to be as large as the second to fourth ones, which are
     measured.
 
-    Parameters
-    ----------
-    image, nominal
-        As for :func:`fit_rims`.
-    centres, radius
-        Result of :func:`fit_rims`.
+    ``image``, ``nominal``: as for :func:`fit_rims`; ``centres``, ``radius``: result of :func:`fit_rims`.
     """
     width = min(_RING, nominal / 2)
     steps = [

@@ -12,10 +12,7 @@ MAX_IMAGES = 4096
 class FrameStack:
     """Frames of a run, or the means of 2, 4, 8 ... consecutive frames once there are too many.
 
-    Parameters
-    ----------
-    limit
-        Largest number of images kept, even.
+    ``limit``: largest number of images kept, even.
 
     Attributes
     ----------

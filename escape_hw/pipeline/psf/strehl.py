@@ -22,6 +22,8 @@ def diffraction_psf(
 ) -> NDArray[np.float32]:
     """Diffraction image of a pupil, by a matrix Fourier transform (Soummer et al. 2007).
 
+    Returns an image of unit sum over an infinite camera, with its peak on the middle pixel.
+
     Parameters
     ----------
     pupil
@@ -32,11 +34,6 @@ def diffraction_psf(
         lambda/D in camera pixels.
     shape
         Camera region (rows, columns).
-
-    Returns
-    -------
-    ndarray of float32, ``(rows, columns)``
-        Of unit sum over an infinite camera, with its peak on the middle pixel.
     """
     n = pupil.shape[0]
     places = (np.arange(n) - (n - 1) / 2) / samples_across
@@ -129,28 +126,22 @@ def _aperture(shape: tuple[int, ...], radius_px: float) -> NDArray[np.float64]:
     return np.asarray(np.clip(radius_px + 0.5 - np.hypot(y - shape[0] // 2, x - shape[1] // 2), 0, 1))
 
 
-def strehl_ratios(
-    image: NDArray[np.floating], model: NDArray[np.floating], cutoff: float | None = None
-) -> NDArray[np.float64]:
+def strehl_ratios(image: NDArray[np.floating], model: NDArray[np.floating]) -> NDArray[np.float64]:
     """Peak, transfer-function and encircled-energy ratios of an image to the model PSF, ``(3,)``.
 
-    Parameters
-    ----------
-    image, model
-        Images ``(rows, columns)`` of the same scale; backgrounds are subtracted.
-    cutoff
-        Radius in cycles per pixel within which the transfer functions are summed; by default where the
-        model's exceeds 1 % of its peak.
+    ``image``, ``model``: images ``(rows, columns)`` of the same scale; backgrounds are subtracted.
     """
-    weights = _ratio_weights(centre_image(model), cutoff)
+    weights = _ratio_weights(centre_image(model))
     return np.asarray(weights @ centre_image(image).ravel())
 
 
-def _ratio_weights(model: NDArray[np.float64], cutoff: float | None = None) -> NDArray[np.float64]:
-    """Weights ``(3, n_pixels)`` whose products with a centred image of unit sum are the three ratios."""
+def _ratio_weights(model: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Weights ``(3, n_pixels)`` whose products with a centred image of unit sum are the three ratios.
+
+    The transfer functions are summed where the model's exceeds 1 % of its peak.
+    """
     ideal = np.fft.fft2(np.fft.ifftshift(model)).real
-    f = np.hypot(*np.meshgrid(*map(np.fft.fftfreq, model.shape), indexing="ij"))
-    inside = f <= cutoff if cutoff else ideal > 0.01 * ideal.max()
+    inside = ideal > 0.01 * ideal.max()
     peak = np.zeros(model.shape)
     middle = tuple(n // 2 for n in model.shape)
     peak[middle] = 1 / model[middle]
@@ -168,17 +159,10 @@ def strehl(frames: NDArray[np.floating], model: NDArray[np.floating]) -> StrehlE
     (see :func:`~escape_hw.pipeline.statistics.standard_error`). It does not include the error of the model
     PSF.
 
-    Parameters
-    ----------
-    frames
-        Science frames in order ``(n, rows, columns)``.
-    model
-        Model PSF, taken without turbulence.
+    ``frames``: science frames in order ``(n, rows, columns)``; ``model``: model PSF, taken without
+    turbulence.
 
-    Returns
-    -------
-    StrehlEstimate
-        Errors are NaN for fewer than :data:`~escape_hw.pipeline.statistics.MIN_SAMPLES` frames.
+    Errors are NaN for fewer than :data:`~escape_hw.pipeline.statistics.MIN_SAMPLES` frames.
 
     Raises
     ------

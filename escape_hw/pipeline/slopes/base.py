@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import abc
+from collections.abc import Callable
 from typing import Generic
 
 import numpy as np
@@ -18,8 +19,6 @@ class FrameSlopes(abc.ABC, Generic[G]):
 
     Parameters
     ----------
-    grid
-        The geometry.
     shape
         Region (rows, columns).
     dark
@@ -55,6 +54,8 @@ class FrameSlopes(abc.ABC, Generic[G]):
         self._gain = np.ascontiguousarray(1 / response)
         self._offset = np.ascontiguousarray(self.dark * self._gain + np.float32(threshold))
         self._light = np.empty(grid.n_valid, np.float32)
+        #: Called with the slopes of each frame.
+        self.observer: Callable[[NDArray[np.float32]], object] | None = None
 
     @property
     def flux(self) -> NDArray[np.float32]:
@@ -75,6 +76,8 @@ class FrameSlopes(abc.ABC, Generic[G]):
             raise ValueError(f"frame has shape {frame.shape}; the slopes were set up for {self.shape}")
         slopes = np.empty(self.grid.n_slopes, np.float32) if out is None else out
         self._compute(frame, slopes, self._light if flux is None else flux)
+        if self.observer is not None:
+            self.observer(slopes)
         return slopes
 
     @abc.abstractmethod

@@ -15,12 +15,7 @@ from escape_hw.pipeline.slopes.base import FrameSlopes
 def slopes_of_image(image: NDArray[Any], pupils: PyramidPupils) -> NDArray[np.float64]:
     """Slopes ``(n_slopes,)`` of a calibrated image, without compiled code; see :class:`PyramidPupils`.
 
-    Parameters
-    ----------
-    image
-        Light per pixel ``(rows, columns)``, background subtracted, in any unit.
-    pupils
-        The pupil images and references.
+    ``image``: light per pixel ``(rows, columns)``, background subtracted, in any unit.
     """
     n = pupils.valid.shape[0]
     ul, ur, ll, lr = (
@@ -79,16 +74,7 @@ def quad_cell_slopes(frame, gain, offset, corners, runs, zero_points, local, slo
 class PyramidSlopes(FrameSlopes[PyramidPupils]):
     """Slope function of pupil images on a camera region.
 
-    Parameters
-    ----------
-    grid
-        The pupil images; ``normalisation`` selects the divisor of the differences.
-    shape
-        Region (rows, columns).
-    dark
-        Dark frame in counts, zeros by default.
-    flat
-        Relative pixel response, ones by default.
+    ``grid``: the pupil images; ``normalisation`` selects the divisor of the differences.
 
     Raises
     ------

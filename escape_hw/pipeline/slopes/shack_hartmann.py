@@ -21,6 +21,8 @@ def subaperture_windows(
     A window contains the pixels whose centres are within half a pitch of the lenslet's centre, so every pixel
     belongs to one lenslet.
 
+    Returns ``(n, 4)``: first row, end row, first column, end column.
+
     Parameters
     ----------
     centres_px
@@ -29,11 +31,6 @@ def subaperture_windows(
         Lenslet pitch in pixels.
     shape
         Region (rows, columns), which limits the windows.
-
-    Returns
-    -------
-    ndarray of int32, ``(n, 4)``
-        First row, end row, first column, end column.
     """
     low = np.ceil(centres_px - pitch_px / 2).astype(np.int32)
     high = np.ceil(centres_px + pitch_px / 2).astype(np.int32)
@@ -123,19 +120,6 @@ def centres_of_gravity(frame, gain, offset, per_pixel, places, weights, zero_poi
 
 class ShackHartmannSlopes(FrameSlopes[SubApertureGrid]):
     """Slope function of a grid on a camera region.
-
-    Parameters
-    ----------
-    grid
-        The sub-aperture grid.
-    shape
-        Region (rows, columns).
-    dark
-        Dark frame in counts, zeros by default.
-    flat
-        Relative pixel response, ones by default.
-    threshold
-        Level in counts above the dark that is subtracted before the centre of gravity.
 
     Raises
     ------

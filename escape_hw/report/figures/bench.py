@@ -86,22 +86,12 @@ def stacked_psfs(loops: Mapping[str, LoopResult], psf_px: float | None = None) -
 def draw_psfs(
     figure: FigureBase, loops: Mapping[str, LoopResult], psf_px: float | None = None, rows: int = 1
 ) -> None:
-    """Draw the PSFs into a figure or a part of one.
+    """Draw the PSFs into a figure or a part of one; runs without an image are left out.
 
-    All images are scaled to the model's flux. Logarithmic
-    stretch relative to the model's maximum, backgrounds taken out; the three Strehl ratios stand
-    below each in the paper's order: peak, optical transfer function, encircled energy.
-
-    Parameters
-    ----------
-    figure
-        Where to draw.
-    loops
-        Closed-loop runs by label; runs without an image are left out.
-    psf_px
-        lambda/D in pixels, for axes in lambda/D; pixels without it.
-    rows
-        Rows of panels.
+    All images are scaled to the model's flux. Logarithmic stretch relative to the model's maximum,
+    backgrounds subtracted; the three Strehl ratios stand below each in the paper's order: peak, optical
+    transfer function, encircled energy. Axes are in lambda/D where ``psf_px`` gives it in pixels, else in
+    pixels.
     """
     shown, model = _loops_with_images(loops), _model_psf(loops)
     images = {label: _subtract_background(loop.psf) for label, loop in shown.items() if loop.psf is not None}
@@ -299,7 +289,7 @@ def temporal_response(response: TemporalResponse) -> Figure:
     style.style_axes(axes).set(xlabel="frames after the command", ylabel="share of the response [%]")
     axes.axhline(0.0, color=style.MUTED, lw=0.7)
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    axes.set_title(f"mean delay {response.delay:.2f} frames", fontsize=9.5)
+    axes.set_title(f"mean delay {response.delay_frames:.2f} frames", fontsize=9.5)
     return figure
 
 

@@ -35,16 +35,7 @@ def draw_mode_maps(figure: FigureBase, matrices: Mapping[str, InteractionMatrix]
     """Draw slope maps of several matrices side by side into a figure or a part of one.
 
     One row per representative mode, one column per matrix; each cell holds the x and the y slopes.
-    Every mode is divided by its rms, so that all share one scale.
-
-    Parameters
-    ----------
-    figure
-        Where to draw.
-    matrices
-        Matrices by the label of their column; a mode that a matrix lacks stays blank.
-    count
-        How many modes to show.
+    Every mode is divided by its rms, so that all share one scale; a mode that a matrix lacks stays blank.
     """
     n_modes = max(matrix.n_modes for matrix in matrices.values())
     modes = representative_modes(n_modes, count)

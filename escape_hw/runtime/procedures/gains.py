@@ -92,7 +92,7 @@ class GainsProcedure(MatrixProcedure["GainsRun"]):
                 self.product.result,
                 poke=self.poke,
                 accuracy=self.accuracy,
-                budget=self.allowed_strehl_loss,
+                allowed_strehl_loss=self.allowed_strehl_loss,
                 frames=self.frames,
                 gain=self.gain,
                 comparisons=self._comparison_matrices(),

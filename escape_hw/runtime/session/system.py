@@ -231,8 +231,9 @@ class System(Bench):
 
         calibration = as_calibration(calibration)
         procedure = bootstrap_gains(
-            self, calibration, poke=poke, accuracy=accuracy, budget=allowed_strehl_loss, frames=frames,
-            gain=gain, closed_loop_matrix=static_light_matrix(self, calibration), model_psf=model_psf,
+            self, calibration, poke=poke, accuracy=accuracy, allowed_strehl_loss=allowed_strehl_loss,
+            frames=frames, gain=gain, closed_loop_matrix=static_light_matrix(self, calibration),
+            model_psf=model_psf,
         )  # fmt: skip
         return self.run(procedure, progress=progress)
 

@@ -28,13 +28,13 @@ IDLE_FRAME_RATE_HZ = 25.0
 #: Longest wait for one of them, which delays a job.
 _IDLE_TIMEOUT_S = 0.5
 REOPEN_REMEDY = "Fix the device, then clear the fault to open the devices again."
-_DEFECT_REMEDY = "See the log."
-
-Job = Callable[[], object]
 
 
 class BenchOwner:
-    """Owns the devices. All methods but those of the first group belong to the main thread."""
+    """Owns the devices. All methods but those of the first group belong to the main thread.
+
+    ``send`` sends a message to the front end.
+    """
 
     def __init__(
         self,
@@ -44,15 +44,15 @@ class BenchOwner:
         state_publisher: StatePublisher,
         send: Callable[[Mapping[str, Any]], object],
     ) -> None:
-        self.bench, self._state, self._publisher = bench, state, publisher
-        self._state_publisher, self._send = state_publisher, send
-        self._jobs: SimpleQueue[Job] = SimpleQueue()
+        self.bench, self.state, self.publisher = bench, state, publisher
+        self.state_publisher, self.send = state_publisher, send
+        self._jobs: SimpleQueue[Callable[[], object]] = SimpleQueue()
         self._flat_replies: list[Callable[[object], object]] = []
         self._flat_replies_lock = threading.Lock()
         self._slopes: tuple[object, SlopeFunction | None] = (None, None)
 
     # ------------------------------------------------------------ any thread
-    def post(self, job: Job) -> None:
+    def post(self, job: Callable[[], object]) -> None:
         """Queue a job for the main thread."""
         self._jobs.put(job)
 
@@ -65,7 +65,7 @@ class BenchOwner:
     def request_safe_state(self, reason: str, remedy: str = "Look at the log, then clear the fault.") -> None:
         """Latch a fault, stop what runs, and make the mirror safe."""
         log.error("FAULT: %s", reason)
-        self._state.latch_fault(reason, remedy)
+        self.state.latch_fault(reason, remedy)
         self.post(lambda: self.make_safe(reason, remedy))
 
     # ------------------------------------------------------------ jobs
@@ -84,7 +84,7 @@ class BenchOwner:
     def report_defect(self, error: Exception) -> None:
         """Log an unexpected exception with its traceback and make the mirror safe."""
         log.error("unexpected exception", exc_info=error)
-        self.make_safe(f"{type(error).__name__}: {error} (this is a defect of ESCAPE)", _DEFECT_REMEDY)
+        self.make_safe(f"{type(error).__name__}: {error} (this is a defect of ESCAPE)", "See the log.")
 
     def _read_idle_frame(self) -> None:
         """Read a frame, and compute its slopes when the sensor's geometry is known."""
@@ -93,17 +93,17 @@ class BenchOwner:
             return
         try:
             frame = bench.wfs.next_frame(_IDLE_TIMEOUT_S)
-            self._state.set_device_message("wfs")
+            self.state.set_device_message("wfs")
             if bench.science is not None:
                 bench.science.poll()
         except FrameTimeout as error:
-            self._state.set_device_message("wfs", str(error))
+            self.state.set_device_message("wfs", str(error))
             return
         except DeviceError as error:
-            if self._state.snapshot.fault is None:
+            if self.state.snapshot.fault is None:
                 self.make_safe(str(error), REOPEN_REMEDY)
             return
-        grid = self._publisher.grid
+        grid = self.publisher.grid
         if grid is not None:
             if self._slopes[0] is not grid:
                 self._slopes = (grid, build_slope_function(bench, grid))
@@ -113,17 +113,17 @@ class BenchOwner:
     # ------------------------------------------------------------ devices
     def open(self) -> None:
         """Open the devices and flatten the mirror; a failure is latched as a fault."""
-        self._state.set_phase(Phase.STARTING)
+        self.state.set_phase(Phase.STARTING)
         bench = self.bench
         try:
             bench.open()
-            self._publisher.set_full_scale(bench.wfs.info.full_scale)
-            bench.callbacks = self._publisher.callbacks
+            self.publisher.set_full_scale(bench.wfs.info.full_scale)
+            bench.callbacks = self.publisher.callbacks
             bench.dm.flatten()
         except EscapeError as error:
             self.make_safe(str(error), REOPEN_REMEDY)
             return
-        self._state.set_phase(Phase.IDLE)
+        self.state.set_phase(Phase.IDLE)
         log.info("%s: %d devices open, mirror flat", bench.config.system.name, len(bench.devices))
 
     def close(self) -> None:
@@ -138,12 +138,12 @@ class BenchOwner:
             log.error("the devices did not close cleanly: %s", error)
             raise
         finally:
-            self._state.set_phase(Phase.STOPPED)
+            self.state.set_phase(Phase.STOPPED)
             self.send_flat_replies()
 
     def clear_fault(self) -> None:
         """Release the fault and open the devices again."""
-        self._state.clear_fault()
+        self.state.clear_fault()
         with contextlib.suppress(EscapeError):
             # A device that does not close cleanly now was the fault itself.
             self.bench.close()
@@ -165,14 +165,14 @@ class BenchOwner:
         with self._flat_replies_lock:
             waiting, self._flat_replies = self._flat_replies, []
         if waiting:
-            self._state_publisher.publish()
-        fault = self._state.snapshot.fault
+            self.state_publisher.publish()
+        fault = self.state.snapshot.fault
         for reply in waiting:
             reply({"fault": None if fault is None else fault.reason})
 
     def make_safe(self, reason: str, remedy: str) -> None:
         """Latch a fault, flatten the mirror as far as possible, and close the device that failed."""
-        self._state.enter_fault(reason, remedy)
+        self.state.enter_fault(reason, remedy)
         log.error("FAULT: %s", reason)
         dm = self.bench.dm
         with contextlib.suppress(EscapeError):
@@ -184,17 +184,17 @@ class BenchOwner:
             if device.is_open and device is not dm and reason.startswith(f"{device.name}:"):
                 with contextlib.suppress(Exception):
                     device.close()
-                self._state.set_device_message(device.name, reason)
+                self.state.set_device_message(device.name, reason)
 
     # ------------------------------------------------------------ while a procedure or the loop runs
     def observe(self, progress: Progress) -> None:
         """Publish the progress of what runs, and pause when requested."""
-        run = self._state.update_progress(progress)
+        run = self.state.update_progress(progress)
         if run is not None:
-            self._send({"progress": run.model_dump(mode="json")})
+            self.send({"progress": run.model_dump(mode="json")})
         if progress.arrays:
-            self._publisher.publish_arrays(progress.arrays, stage=progress.stage, done=float(progress.done))
-        if self._state.snapshot.paused:
+            self.publisher.publish_arrays(progress.arrays, stage=progress.stage, done=float(progress.done))
+        if self.state.snapshot.paused:
             self._pause_until_resumed()
 
     def _pause_until_resumed(self) -> None:
@@ -203,10 +203,10 @@ class BenchOwner:
         shape = dm.shape
         dm.flatten()
         log.info("paused, mirror flat")
-        self._state.mark_run_paused(True)
-        while self._state.snapshot.paused and not self._state.stop_requested:
+        self.state.mark_run_paused(True)
+        while self.state.snapshot.paused and not self.state.stop_requested:
             time.sleep(0.02)
-        self._state.mark_run_paused(False)
-        if not self._state.stop_requested:
+        self.state.mark_run_paused(False)
+        if not self.state.stop_requested:
             ramp_to(dm, shape)
             log.info("resumed")

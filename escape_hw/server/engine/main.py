@@ -14,14 +14,10 @@ from escape_hw.config.loader import load_text
 from escape_hw.remote.state import State
 from escape_hw.runtime.session.system import System
 from escape_hw.server.engine.bench_owner import BenchOwner
-from escape_hw.server.engine.loop import LoopRunner
-from escape_hw.server.engine.planning import ProcedurePlanner
-from escape_hw.server.engine.procedures import ProcedureRegistry
 from escape_hw.server.engine.product_store import ProductStore
-from escape_hw.server.engine.publisher import StreamPublisher
-from escape_hw.server.engine.recording import TelemetryRecording
-from escape_hw.server.engine.request_handler import RequestHandler, Services
-from escape_hw.server.engine.runner import ProcedureRunner
+from escape_hw.server.engine.publisher import StreamPublisher, TelemetryRecording
+from escape_hw.server.engine.request_handler import RequestHandler
+from escape_hw.server.engine.runner import LoopRunner, ProcedureRunner
 from escape_hw.server.engine.state import EngineState, LoopParameters
 from escape_hw.server.engine.state_publisher import StatePublisher
 from escape_hw.server.ipc.channel import Channel, EngineSetup
@@ -47,16 +43,13 @@ class Engine:
             bench, state, publisher, store, setup.runs, self._send_state, recording.state
         )
         owner = self._owner = BenchOwner(bench, state, publisher, state_publisher, channel.post)
-        loop_runner = LoopRunner(owner, state, publisher, state_publisher, store)
+        loop_runner = LoopRunner(owner, store)
         procedure_runner = ProcedureRunner(
-            owner, loop_runner, state, publisher, state_publisher, store,
-            config_text=setup.config_text, runs=setup.runs, send=channel.post,
-        )  # fmt: skip
-        services = Services(
-            state, state_publisher, publisher, store, ProcedureRegistry(config), ProcedurePlanner(bench),
-            recording, owner, loop_runner, procedure_runner,
-        )  # fmt: skip
-        self._request_handler = RequestHandler(services, channel.post, self.request_stop)
+            owner, loop_runner, store, config_text=setup.config_text, runs=setup.runs
+        )
+        self._request_handler = RequestHandler(
+            owner, loop_runner, procedure_runner, store, recording, self.request_stop
+        )
 
     def request_stop(self) -> None:
         """Stop what runs and end; from any thread."""

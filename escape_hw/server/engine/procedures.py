@@ -1,18 +1,28 @@
-"""The procedures as a server offers them: entries for clients, checks of arguments, requests."""
+"""The procedures as a server offers them: entries for clients, checks of arguments, requests, plans."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from functools import reduce
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import norm
+
+from escape_hw.calibration.acquisition.pokes import compute_poke_amplitudes
+from escape_hw.calibration.docrime.open_loop import minimum_frames
+from escape_hw.calibration.modes.bases import build_modal_basis
 from escape_hw.config.system import SystemConfig
 from escape_hw.errors import ConfigError
-from escape_hw.remote.state import Arguments, ProcedureEntry, ProcedureParameter
+from escape_hw.remote.state import Arguments, ProcedureEntry, ProcedureParameter, ProcedurePlan
 from escape_hw.runtime.procedures.calibration import CalibrationProcedure
 from escape_hw.runtime.procedures.declaration import Parameter, ProcedureSpec, check_arguments, present_names
 from escape_hw.runtime.procedures.registry import PROCEDURES, find_procedure
 from escape_hw.server.engine.product_store import ProductStore
+
+if TYPE_CHECKING:
+    from escape_hw.bench import Bench
 
 
 def offered_parameters(procedure: type[ProcedureSpec[Any]]) -> tuple[Parameter, ...]:
@@ -21,13 +31,7 @@ def offered_parameters(procedure: type[ProcedureSpec[Any]]) -> tuple[Parameter, 
 
 
 class ProcedureRegistry:
-    """The procedures that a server offers for its system.
-
-    Parameters
-    ----------
-    config
-        The system's configuration; it has the defaults of many parameters.
-    """
+    """The procedures that a server offers for its system, whose configuration has many of the defaults."""
 
     def __init__(self, config: SystemConfig) -> None:
         self._config = config
@@ -58,13 +62,7 @@ class ProcedureRegistry:
         return ",".join(value) if isinstance(value, tuple) else value
 
     def arguments(self, name: str, given: Arguments) -> Arguments:
-        """All arguments of a procedure, defaults included.
-
-        Raises
-        ------
-        ConfigError
-            There is no such procedure, or an argument is wrong.
-        """
+        """All arguments of a procedure, defaults included (ConfigError: unknown name, wrong argument)."""
         parameters = offered_parameters(find_procedure(name))
         values = check_arguments(map(_as_sent, parameters), given)
         defaults = {one.name: self._default(one) for one in parameters}
@@ -73,12 +71,8 @@ class ProcedureRegistry:
     def task(self, name: str, given: Arguments, product_store: ProductStore) -> ProcedureSpec[Any]:
         """The request for a run with these arguments.
 
-        A resumed run keeps its own arguments and settings where none are given.
-
-        Raises
-        ------
-        ConfigError, ProductError
-            An argument is wrong, a matrix is unknown, or the run cannot be resumed.
+        A resumed run keeps its own arguments and settings where none are given. ConfigError or ProductError:
+        an argument is wrong, a matrix is unknown, or the run cannot be resumed.
         """
         procedure = find_procedure(name)
         parameters = offered_parameters(procedure)
@@ -107,3 +101,86 @@ def _as_sent(one: Parameter) -> Parameter:
 def needs_loop(name: str, arguments: Arguments) -> bool:
     """Whether a procedure works in closed loop, so that it cannot be paused between two frames."""
     return find_procedure(name).works_in_closed_loop(arguments)
+
+
+#: Standard deviations of the sum of random pokes that some actuator reaches in a run.
+_PEAK_SIGMAS = 4.0
+#: Share of the frames whose pokes the limits may shorten before the plan says so.
+_CLIPPED_WARNING_SHARE = 0.05
+
+
+class ProcedurePlanner:
+    """Plans procedures on an open bench; nothing is moved."""
+
+    def __init__(self, bench: Bench) -> None:
+        self._bench = bench
+        self._m2c: NDArray[np.float64] | None = None
+
+    def plan(self, name: str, arguments: Arguments) -> ProcedurePlan:
+        """The plan of a procedure; ``arguments`` are complete (EscapeError: no modal basis)."""
+        rate = self._bench.wfs.settings.frame_rate_hz
+        procedure = find_procedure(name)
+        frames, random_pokes = procedure.planned_frames(self._bench, arguments), procedure.random_pokes
+        poke_per_mode = self._poke_per_mode(arguments)
+        return ProcedurePlan(
+            name=name, arguments=dict(arguments), frames=frames, seconds=frames / rate,
+            stroke=min(_peak_command(random_pokes, poke_per_mode), self._bench.dm.limits.max_stroke),
+            warnings=tuple(self._warnings(name, arguments, random_pokes, poke_per_mode)),
+        )  # fmt: skip
+
+    def _poke_per_mode(self, arguments: Arguments) -> NDArray[np.float64]:
+        """Largest poke of every actuator by every mode ``(n_act, n_modes)``, fraction of full stroke."""
+        poke = arguments.get("poke")
+        if poke is None:
+            return np.zeros((0, 0))
+        if self._m2c is None:
+            self._m2c = build_modal_basis(self._bench)
+        return np.abs(self._m2c * compute_poke_amplitudes(self._bench, self._m2c, float(poke)))
+
+    def _warnings(
+        self, name: str, arguments: Arguments, random_pokes: bool, poke_per_mode: NDArray[np.float64]
+    ) -> list[str]:
+        bench, found = self._bench, []
+        limit = bench.dm.limits.max_stroke
+        share = _clipped_frames_bound(random_pokes, poke_per_mode, limit)
+        if share > _CLIPPED_WARNING_SHARE:
+            found.append(
+                f"in {100 * share:.2g} % of the frames the pokes would exceed {limit:g} of the stroke; "
+                "such a command is scaled down as a whole, and the estimator uses the scaled pokes"
+            )
+        frames = int(arguments.get("frames") or 0)
+        least = minimum_frames(bench.config.calibration, bench.config.basis.n_modes)
+        if name in ("docrime", "push-pull-fast") and frames < least:
+            found.append(f"{frames} frames cannot constrain the modes; at least {least} are needed")
+        if name == "push-pull" and bench.screen is None and not bench.simulated:
+            found.append("push-pull needs a source: make sure that no turbulence is in the beam")
+        if arguments.get("snr") is not None or arguments.get("accuracy") is not None:
+            found.append("the run stops earlier if the target is reached")
+        return found
+
+
+def _command_std(poke_per_mode: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Standard deviation of every actuator's command when all modes are poked at once ``(n_act,)``.
+
+    Uniform pokes of amplitude ``a`` have the standard deviation ``a / sqrt(3)``.
+    """
+    return np.asarray(np.sqrt(np.square(poke_per_mode).sum(axis=1) / 3), np.float64)
+
+
+def _peak_command(random_pokes: bool, poke_per_mode: NDArray[np.float64]) -> float:
+    """Largest command of an actuator in a run, before clipping, fraction of full stroke."""
+    if not poke_per_mode.size:
+        return 0.0
+    if not random_pokes:
+        return float(poke_per_mode.max())
+    return float(np.minimum(_PEAK_SIGMAS * _command_std(poke_per_mode), poke_per_mode.sum(axis=1)).max())
+
+
+def _clipped_frames_bound(random_pokes: bool, poke_per_mode: NDArray[np.float64], limit: float) -> float:
+    """Upper bound of the share of frames in which an actuator exceeds the limit (union bound)."""
+    if not poke_per_mode.size or _peak_command(random_pokes, poke_per_mode) <= limit:
+        return 0.0
+    if not random_pokes:
+        return 1.0
+    command_std = _command_std(poke_per_mode)
+    return float(min(1.0, 2 * norm.sf(limit / command_std[command_std > 0]).sum()))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any
 
 from escape_hw.errors import ConfigError, ProductError
 from escape_hw.io.fits import file as fits_file
@@ -36,13 +35,7 @@ class ProductStore:
         return Path(product.path)
 
     def readable_path(self, path: str) -> Path:
-        """Resolve a path from a client.
-
-        Raises
-        ------
-        ProductError
-            The path is outside the folders that clients may load from.
-        """
+        """Resolve a path from a client (ProductError: outside the folders that clients may load from)."""
         resolved = Path(path).expanduser().resolve()
         if not any(resolved.is_relative_to(folder) for folder in self._folders):
             where = ", ".join(map(str, self._folders))
@@ -59,10 +52,7 @@ class ProductStore:
     def add(self, path: Path, name: str | None = None) -> ProductEntry:
         """Add a file under a name, by default its own; a product of the same name is replaced.
 
-        Raises
-        ------
-        ProductError
-            The file cannot be read, is damaged, or of another kind.
+        ProductError: the file cannot be read, is damaged, or of another kind.
         """
         hdus, _ = fits_file.read(path)
         kind = str(fits_file.header_dict(hdus).get("KIND", ""))
@@ -92,8 +82,6 @@ def _psf(path: Path) -> tuple[str, str]:
     return "psf", f"loop with {result.method}, {result.frames} frames"
 
 
-_KINDS: dict[str, Callable[[Path], tuple[str, Any]]] = {
-    KIND_MATRIX: _matrix,
-    KIND_GAINS: _gains,
-    KIND_PSF: _psf,
-}
+_KINDS: dict[str, Callable[[Path], tuple[str, str]]] = {
+    KIND_MATRIX: _matrix, KIND_GAINS: _gains, KIND_PSF: _psf,
+}  # fmt: skip

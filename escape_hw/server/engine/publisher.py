@@ -1,4 +1,4 @@
-"""Publishes frames, slopes, commands and results in shared memory."""
+"""Publishes frames, slopes, commands and results in shared memory, and records them."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import json
 import logging
 import time
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,9 +15,12 @@ from numpy.typing import NDArray
 from escape_hw.api.callbacks import Callbacks
 from escape_hw.api.camera import Frame
 from escape_hw.api.sensor import SensorGeometry
-from escape_hw.errors import StorageError
+from escape_hw.errors import RequestRefused, StorageError
+from escape_hw.io.run_folder import dated_folder
+from escape_hw.io.storage import check_writable, make_folder
 from escape_hw.remote.source import STREAMS
-from escape_hw.remote.state import StreamEntry
+from escape_hw.remote.state import RecordingState, StreamEntry
+from escape_hw.streams.recording.process import RecorderProcess
 from escape_hw.streams.ring import SLOTS, RingWriter
 from escape_hw.streams.segments import segment_name
 
@@ -25,16 +29,11 @@ log = logging.getLogger(__name__)
 #: Least capacity of a ring's entry, so that growing arrays seldom need a new ring.
 _MIN_BYTES = 16384
 #: Entries kept of streams that are recorded at full rate; they bridge delays of the recorder.
-_SLOTS = {"frames": 16, "slopes": 64, "modes": 64, "commands": 64}
+_SLOTS = {"frames": 16, "slopes": 64, "residual_modes": 64, "commands": 64}
 
 
 class StreamPublisher:
-    """One ring per stream, created with its first entry.
-
-    Parameters
-    ----------
-    system
-        Name of the system, part of the segments' names.
+    """One ring per stream, created with its first entry. ``system`` is part of the segments' names.
 
     Attributes
     ----------
@@ -62,7 +61,7 @@ class StreamPublisher:
 
     def set_full_scale(self, counts: float) -> None:
         """Set the value at which a pixel of the sensor's camera is saturated; part of every frame's entry."""
-        # "top" is the key of 0.1.0, which recorded files contain.
+        # "top" is the key of version 0.1.0; version 0.3.0 removes it.
         self._full_scale_meta = json.dumps({"full_scale": counts, "top": counts}).encode()
 
     @property
@@ -144,7 +143,7 @@ class StreamPublisher:
 
     def _residual(self, index: int, modes: NDArray[np.float32], rms: float) -> None:
         self.residual_nm = rms
-        self._write("modes", modes, index)
+        self._write("residual_modes", modes, index)
 
     def _write(
         self, name: str, data: NDArray[Any], index: int, exposed_ns: int = 0, meta: bytes = b""
@@ -152,3 +151,58 @@ class StreamPublisher:
         ring = self._ring(name, data)
         if ring is not None:
             ring.write(data, index, exposed_ns, time.monotonic_ns(), meta)
+
+
+#: The streams with an entry for every frame.
+_RECORDED_STREAMS = ("frames", "slopes", "residual_modes", "commands", "psf")
+
+
+class TelemetryRecording:
+    """Records the streams at full rate, in a process that the loop does not wait for."""
+
+    def __init__(self, runs: Path, publisher: StreamPublisher) -> None:
+        self._runs, self._publisher = runs, publisher
+        self._process: RecorderProcess | None = None
+        self._last = RecordingState()
+
+    def set_recording(self, on: bool) -> RecordingState:
+        """Start or stop; does nothing when the recording is in that state already.
+
+        RequestRefused when there is no stream yet; StorageError when folder or process are not available.
+        """
+        if on and self._process is None:
+            self._start()
+        elif not on and self._process is not None:
+            process = self._process
+            self._last = self.state().model_copy(update={"recording": False})
+            self._process = None
+            end = process.stop()
+            self._last = RecordingState(path=str(process.folder), written=end.written, dropped=end.dropped)
+            log.info("recorded %d entries in %s, %d dropped", end.written, process.folder, end.dropped)
+        return self.state()
+
+    def _start(self) -> None:
+        segments = {one.name: one.segment for one in self._publisher.entries if one.name in _RECORDED_STREAMS}
+        if not segments:
+            raise RequestRefused("there is nothing to record yet; wait for the first frame")
+        folder = dated_folder(self._runs, "telemetry")
+        make_folder(folder)
+        check_writable(folder)
+        self._process = RecorderProcess(folder, segments)
+        log.info("recording %s in %s", ", ".join(segments), folder)
+
+    def state(self) -> RecordingState:
+        """Progress of the recording, or how the last one ended."""
+        process = self._process
+        if process is None:
+            return self._last
+        now = process.state
+        state = RecordingState(
+            recording=True, path=str(process.folder), written=now.written, dropped=now.dropped
+        )
+        if now.fault or not process.running:
+            fault = now.fault or "the recorder process ended"
+            log.error("recording ended: %s", fault)
+            self._process = None
+            self._last = state = state.model_copy(update={"recording": False, "fault": fault})
+        return state

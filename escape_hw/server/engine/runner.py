@@ -1,30 +1,147 @@
-"""Runs procedures: run folder, result, products, and the loop that was closed before."""
+"""Runs the closed loop and the procedures, with run folders, results and products."""
 
 from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
+from escape_hw.api.concurrency import SignalSafeFlag
 from escape_hw.api.procedure import run as run_procedure
+from escape_hw.calibration.loop.control import LoopControl
+from escape_hw.calibration.loop.operation import run_until_opened
 from escape_hw.config.loader import load_text
 from escape_hw.config.system import SystemConfig
 from escape_hw.errors import Aborted, CommandRejected, DeviceError, EscapeError, SettingRejected
 from escape_hw.io.documents import to_plain_values
+from escape_hw.io.fits.matrix import MatrixProduct
 from escape_hw.io.run_folder import RunFolder, dated_folder
+from escape_hw.remote.requests import CloseLoop, SetLoop
 from escape_hw.remote.state import Arguments, Finish, FinishedRun
 from escape_hw.runtime.procedures.declaration import ProcedureSpec, SavedRun
+from escape_hw.runtime.procedures.matrix_input import load_fitting_matrix, require_hardware_matrix
 from escape_hw.runtime.session.record import BenchRecord
 from escape_hw.server.engine.bench_owner import BenchOwner
-from escape_hw.server.engine.loop import LoopRunner
 from escape_hw.server.engine.product_store import ProductStore
-from escape_hw.server.engine.publisher import StreamPublisher
-from escape_hw.server.engine.state import EngineState, LoopParameters, RunTicket
-from escape_hw.server.engine.state_publisher import StatePublisher
+from escape_hw.server.engine.state import LoopParameters, RunTicket
 
 log = logging.getLogger(__name__)
+
+_REMEDY = "Fix the device, then clear the fault."
+#: Called once: with ``None`` when the loop is closed, or with the reason why it cannot be closed.
+OnClosed = Callable[[EscapeError | None], object]
+
+
+class LoopRunner:
+    """Closes the loop and changes its parameters."""
+
+    def __init__(self, owner: BenchOwner, product_store: ProductStore) -> None:
+        self._owner, self._bench, self._state = owner, owner.bench, owner.state
+        #: A procedure replaces the bench's configuration while it runs.
+        self._config = owner.bench.config
+        self._product_store = product_store
+        #: PSF without turbulence ``(rows, columns)``, once measured; the running Strehl ratio needs it.
+        self.model_psf: NDArray[np.float32] | None = None
+
+    def prepare(self, request: CloseLoop | LoopParameters) -> tuple[LoopParameters, LoopControl]:
+        """Load the matrix and compute the reconstructor; nothing moves.
+
+        ConfigError, ProductError, IncompatibleProduct or CalibrationError: a parameter is out of range, or
+        the matrix does not fit this bench.
+        """
+        settings = self._merge(request)
+        control = LoopControl(
+            self._bench, self._load_matrix(settings.matrix).result,
+            gain=settings.gain, leak=settings.leak, dropped_modes=settings.dropped_modes,
+        )  # fmt: skip
+        return settings, control
+
+    def close(self, request: CloseLoop, on_closed: OnClosed) -> None:
+        """Close the loop until it is opened.
+
+        RequestRefused unless the engine is idle; errors of :meth:`prepare`.
+        """
+        self._state.check_can_start(needs_loop=False)
+        settings, control = self.prepare(request)
+        self.post(settings, control, self._state.begin_loop(settings, control), on_closed)
+
+    def post(
+        self, settings: LoopParameters, control: LoopControl, stop: SignalSafeFlag, on_closed: OnClosed
+    ) -> None:
+        """Queue a loop that the engine's state has accepted."""
+        self._owner.post(lambda: self._run(settings, control, stop, on_closed))
+
+    def change(self, request: SetLoop) -> None:
+        """Change the parameters of the loop, closed or not; those that are absent stay.
+
+        After an error (see :meth:`prepare`) the loop continues unchanged.
+        """
+        before, control = self._state.snapshot.loop, self._state.snapshot.loop_control
+        settings = self._merge(request)
+        product = None if request.matrix is None else self._load_matrix(request.matrix)
+        if control is not None:
+            control.request_change(
+                calibration=None if product is None else product.result,
+                gain=request.gain, leak=request.leak, dropped_modes=request.dropped_modes,
+            )  # fmt: skip
+        self._state.set_loop_settings(settings)
+        old = asdict(before)
+        changes = [f"{key} {old[key]} -> {new}" for key, new in asdict(settings).items() if old[key] != new]
+        log.info("loop: %s", ", ".join(changes) or "unchanged")
+
+    def _merge(self, request: CloseLoop | SetLoop | LoopParameters) -> LoopParameters:
+        requested = {key: getattr(request, key) for key in ("matrix", "gain", "leak", "dropped_modes")}
+        return replace(
+            self._state.snapshot.loop, **{key: value for key, value in requested.items() if value is not None}
+        )
+
+    def _load_matrix(self, name: str) -> MatrixProduct:
+        # Real drivers may be connected to simulated libraries: the open devices decide what is a simulation.
+        product = load_fitting_matrix(
+            self._product_store.matrix_path(name), self._config, self._bench.simulated
+        )
+        require_hardware_matrix(product, self._bench, force=False)
+        return product
+
+    def _run(
+        self, settings: LoopParameters, control: LoopControl, stop: SignalSafeFlag, on_closed: OnClosed
+    ) -> None:
+        """Keep the loop closed until it is opened; in the main thread."""
+        state = self._state
+        try:
+            self._bench.wfs.stop()
+            self._owner.publisher.reset_residual()
+            state.set_loop_closed(True)
+            self._owner.state_publisher.publish()
+            on_closed(None)
+            log.info("loop closed on '%s', gain %g", settings.matrix, settings.gain)
+            end = run_procedure(
+                run_until_opened(self._bench, control, model_psf=self.model_psf),
+                observers=(self._owner.observe,), abort=stop,
+            )  # fmt: skip
+            log.info("loop open after %d frames, %d lost; mirror flat", end.frames, end.lost_frames)
+            if end.fault:
+                # The parameters that led to the fault are not the default of the next loop.
+                matrix = state.snapshot.loop.matrix
+                state.set_loop_settings(LoopParameters.from_config(self._config, matrix))
+                self._owner.make_safe(f"the loop was opened: {end.fault}", _REMEDY)
+        except Aborted:
+            log.info("loop open, mirror flat")
+        except EscapeError as error:
+            was_closed = state.snapshot.loop_closed
+            self._owner.make_safe(str(error), _REMEDY)
+            if not was_closed:
+                on_closed(error)
+        finally:
+            state.end_loop()
+            self._owner.send_flat_replies()
+
 
 #: What happens to a closed loop when a procedure closes one of its own.
 LOOP_IS_RESTORED = "it is opened for this procedure, and closed again with the same parameters afterwards"
@@ -39,19 +156,14 @@ class ProcedureRunner:
         self,
         owner: BenchOwner,
         loop_runner: LoopRunner,
-        state: EngineState,
-        publisher: StreamPublisher,
-        state_publisher: StatePublisher,
         product_store: ProductStore,
         *,
         config_text: str,
         runs: Path,
-        send: Callable[[Mapping[str, Any]], object],
     ) -> None:
-        self._owner, self._bench, self._loop_runner, self._state = owner, owner.bench, loop_runner, state
-        self._publisher, self._state_publisher = publisher, state_publisher
-        self._product_store = product_store
-        self._config_text, self._runs, self._send = config_text, runs, send
+        self._owner, self._bench, self._state = owner, owner.bench, owner.state
+        self._loop_runner, self._product_store = loop_runner, product_store
+        self._config_text, self._runs = config_text, runs
 
     def start(self, task: ProcedureSpec[Any], name: str, arguments: Arguments, needs_loop: bool) -> int:
         """Load a task, reserve the engine and queue the procedure; returns the number of its run."""
@@ -69,7 +181,7 @@ class ProcedureRunner:
         words = ", ".join(f"{key} {value}" for key, value in run.arguments.items() if value is not None)
         log.info("run %d: %s %s", run.id, run.name, words)
         previous_config, bench.config = bench.config, config
-        self._publisher.reset_residual()
+        self._owner.publisher.reset_residual()
         self._state.set_loop_closed(self._state.snapshot.needs_loop)
         try:
             finished = self._run_in_folder(ticket, task)
@@ -82,8 +194,8 @@ class ProcedureRunner:
         self._store_products(finished)
         self._finish(finished, ticket.loop_before)
         # The state that clients receive before the end of the run lists its products.
-        self._state_publisher.publish()
-        self._send({"ended": finished.model_dump(mode="json")})
+        self._owner.state_publisher.publish()
+        self._owner.send({"ended": finished.model_dump(mode="json")})
         self._owner.send_flat_replies()
 
     def _run_in_folder(self, ticket: RunTicket, task: ProcedureSpec[Any]) -> FinishedRun:
@@ -94,7 +206,7 @@ class ProcedureRunner:
             kind = f"{task.kind}-{run.id}"
             with RunFolder(system, task.kind, dated_folder(self._runs, system, kind)) as folder:
                 folder.write_config(self._bench.config.to_toml())
-                self._send({"run": {"id": run.id, "name": run.name, "folder": str(folder.path)}})
+                self._owner.send({"run": {"id": run.id, "name": run.name, "folder": str(folder.path)}})
                 saved, stop = self._run_and_save(ticket, task, folder)
         except Exception as error:
             self._owner.flatten()
@@ -102,7 +214,7 @@ class ProcedureRunner:
             if not isinstance(error, EscapeError):
                 self._owner.report_defect(error)
             elif isinstance(error, DeviceError) and not isinstance(error, SettingRejected | CommandRejected):
-                self._owner.make_safe(str(error), "Fix the device, then clear the fault.")
+                self._owner.make_safe(str(error), _REMEDY)
             place = "" if folder is None else str(folder.path)
             return FinishedRun(id=run.id, name=run.name, finish=finish, message=str(error), folder=place)
         message = "" if saved.met else "it did not meet its own criteria"
@@ -140,10 +252,10 @@ class ProcedureRunner:
         self._state.set_loop_closed(False)
         grid, psf = getattr(result, "grid", None), getattr(result, "model_psf", None)
         if grid is not None:
-            self._publisher.set_geometry(grid)
+            self._owner.publisher.set_geometry(grid)
         if psf is not None:
             self._loop_runner.model_psf = psf
-            self._publisher.publish_arrays({"model_psf": psf})
+            self._owner.publisher.publish_arrays({"model_psf": psf})
         saved = task.save(folder, record, result, time.monotonic() - began)
         if stop is None:
             task.finish()

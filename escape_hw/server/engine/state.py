@@ -36,32 +36,23 @@ class LoopParameters:
 
 @dataclass(frozen=True, slots=True)
 class EngineSnapshot:
-    """State of the engine at one moment.
+    """State of the engine at one moment."""
 
-    Parameters
-    ----------
-    loop
-        Parameters of the loop, closed or not.
-    needs_loop
-        Whether the present activity works in closed loop.
-    paused
-        Whether the operator asked the procedure to pause.
-    loop_control, loop_statistics
-        Control of the loop outside procedures, and its newest metrics; ``None`` and empty when there is none.
-    device_messages
-        Newest problem of each device, by its key in ``[devices]``.
-    """
-
+    #: Parameters of the loop, closed or not.
     loop: LoopParameters
     phase: Phase = Phase.STARTING
     fault: FaultState | None = None
     active_run: ActiveRun | None = None
     last_run: FinishedRun | None = None
+    #: Whether the operator asked the procedure to pause.
     paused: bool = False
     loop_closed: bool = False
+    #: Whether the present activity works in closed loop.
     needs_loop: bool = False
+    #: Control of the loop outside procedures, and its newest metrics; ``None`` and empty when there is none.
     loop_control: LoopControl | None = None
     loop_statistics: Mapping[str, float] = field(default_factory=dict)
+    #: Newest problem of each device, by its key in ``[devices]``.
     device_messages: Mapping[str, str] = field(default_factory=dict)
 
 

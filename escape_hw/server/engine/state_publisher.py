@@ -1,4 +1,4 @@
-"""Publishes the engine's state periodically, independently of the main thread."""
+"""State of the engine, its devices and its geometry as documents for clients, published periodically."""
 
 from __future__ import annotations
 
@@ -15,18 +15,25 @@ from pathlib import Path
 import numpy as np
 
 from escape_hw.api.camera import Frame
+from escape_hw.api.device import Device
+from escape_hw.api.outlines import outlines
+from escape_hw.api.sensor import SensorGeometry
 from escape_hw.bench import Bench
 from escape_hw.io.provenance import format_utc, get_software_version
 from escape_hw.remote.state import (
+    DeviceHealth,
+    DeviceState,
     DiskState,
     FrameCounters,
+    Geometry,
+    Illumination,
     LatencyState,
     LoopState,
     MirrorState,
     RecordingState,
     State,
 )
-from escape_hw.server.engine.bench_status import device_states, illumination_of
+from escape_hw.runtime.session.record import actuator_layout, actuator_positions
 from escape_hw.server.engine.product_store import ProductStore
 from escape_hw.server.engine.publisher import StreamPublisher
 from escape_hw.server.engine.state import EngineSnapshot, EngineState
@@ -89,9 +96,10 @@ class StatePublisher:
         """Collect the state; the front end adds lease, clients and its own process."""
         now, bench, publisher = self._engine_state.snapshot, self._bench, self._publisher
         frame = publisher.latest_frame
-        illumination = {} if frame is None or not bench.wfs.is_open else {
-            "illumination": illumination_of(frame, bench.wfs.info.full_scale)
-        }  # fmt: skip
+        illumination = Illumination()
+        if frame is not None and bench.wfs.is_open:
+            peak = float(frame.data.max()) / bench.wfs.info.full_scale
+            illumination = Illumination(saturated=frame.n_saturated / frame.data.size, peak=peak)
         return State(
             at_utc=format_utc(), engine_pid=os.getpid(), version=get_software_version(),
             system=bench.config.system.name, simulated=bench.simulated, seed=bench.config.system.seed,
@@ -100,7 +108,7 @@ class StatePublisher:
             latency=_latency(now.loop_statistics),
             active_run=now.active_run, last_run=now.last_run, products=self._product_store.products,
             recording=self._recording(), disk=self._disk(), streams=publisher.entries,
-            geometry_version=publisher.geometry_version, **illumination,
+            geometry_version=publisher.geometry_version, illumination=illumination,
         )  # fmt: skip
 
     def _loop(self, now: EngineSnapshot) -> LoopState:
@@ -162,3 +170,58 @@ def _latency(metrics: Mapping[str, float]) -> LatencyState:
 def _finite_metric(metrics: Mapping[str, float], name: str) -> float | None:
     value = metrics.get(name, math.nan)
     return value if math.isfinite(value) else None
+
+
+def device_states(bench: Bench, device_messages: Mapping[str, str]) -> tuple[DeviceState, ...]:
+    """State of every device; ``device_messages`` holds their problems by name."""
+    return tuple(
+        _device(name, kind, getattr(bench, name), device_messages)
+        for name, kind in (
+            ("dm", "deformable mirror"),
+            ("wfs", "wavefront sensor camera"),
+            ("modulator", "modulator"),
+            ("science", "science camera"),
+            ("screen", "phase screen"),
+        )
+        if getattr(bench, name) is not None
+    )
+
+
+def _device(name: str, kind: str, device: Device, device_messages: Mapping[str, str]) -> DeviceState:
+    message = device_messages.get(name, "")
+    if not device.is_open:
+        health = DeviceHealth.LOST if message else DeviceHealth.CLOSED
+        return DeviceState(
+            name=name, kind=kind, model="", serial="", simulated=False, health=health, message=message
+        )
+    info = device.info  # type: ignore[attr-defined]
+    return DeviceState(
+        name=name, kind=kind, model=info.model, serial=info.serial, simulated=bool(info.simulated),
+        health=DeviceHealth.STALE if message else DeviceHealth.OK, facts=_facts(device), message=message,
+    )  # fmt: skip
+
+
+def _facts(device: Device) -> dict[str, float | str]:
+    info = device.info  # type: ignore[attr-defined]
+    settings = getattr(device, "settings", None)
+    if settings is not None:
+        return {
+            "frame_rate_hz": float(settings.frame_rate_hz),
+            "exposure_ms": 1e3 * float(settings.exposure_s),
+            "pixels": f"{settings.region.width} x {settings.region.height}",
+        }
+    if hasattr(info, "n_act"):
+        return {"actuators": float(info.n_act), "stroke_um": 1e6 * float(info.stroke_m)}
+    return {}
+
+
+def geometry_of(bench: Bench, grid: SensorGeometry | None) -> Geometry:
+    """Positions of the sub-apertures and actuators."""
+    valid = () if grid is None else tuple("".join("1" if one else "0" for one in row) for row in grid.valid)
+    return Geometry(
+        valid=valid,
+        layout=actuator_layout(bench),
+        positions_m=actuator_positions(bench),
+        outlines_px=() if grid is None else outlines(grid),
+        n_modes=bench.config.basis.n_modes,
+    )

@@ -27,6 +27,8 @@ class EngineProcess:
 
     Attributes
     ----------
+    process, failsafe
+        The engine's process, and the fail-safe process.
     connection
         The front end's end of the channel, for a poller.
     ended_cleanly
@@ -40,12 +42,12 @@ class EngineProcess:
         self._pipe_end, held_end = os.pipe()
         try:
             descriptors = (engine_end.fileno(), held_end)
-            self._process = ChildProcess(_ENGINE, *map(str, descriptors), pass_fds=descriptors)
+            self.process = ChildProcess(_ENGINE, *map(str, descriptors), pass_fds=descriptors)
             self._failsafe_settings = FailsafeSettings(
-                config_text=setup.config_text, incidents=incidents, pid=self._process.pid,
-                started=process_start(self._process.pid) or 0,
+                config_text=setup.config_text, incidents=incidents, pid=self.process.pid,
+                started=process_start(self.process.pid) or 0,
             )  # fmt: skip
-            self._failsafe, self._backoff = self._start_failsafe(), Backoff()
+            self.failsafe, self._backoff = self._start_failsafe(), Backoff()
         finally:
             engine_end.close()
             os.close(held_end)
@@ -77,18 +79,13 @@ class EngineProcess:
         pause = self._backoff.begin_attempt()
         log.error(
             "the fail-safe process (%d) died; it is restarted, and not again within %g s",
-            self._failsafe.pid, pause,
+            self.failsafe.pid, pause,
         )  # fmt: skip
         try:
-            self._failsafe = self._start_failsafe()
+            self.failsafe = self._start_failsafe()
         except OSError as error:
             # Lack of memory, for example, must not end the server as well.
             log.error("the fail-safe process cannot be started; next attempt in %g s: %s", pause, error)
-
-    @property
-    def pid(self) -> int:
-        """Number of the engine's process."""
-        return self._process.pid
 
     def send(self, message: Mapping[str, Any]) -> None:
         """Send a message without waiting; what the engine does not accept now is sent later."""
@@ -115,30 +112,16 @@ class EngineProcess:
                 self.ended_cleanly = self.ended_cleanly or "clean_exit" in message
                 yield message
 
-    @property
-    def running(self) -> bool:
-        """Whether the engine's process has not ended."""
-        return self._process.running
-
-    @property
-    def failsafe_is_running(self) -> bool:
-        """Whether the fail-safe process has not ended."""
-        return self._failsafe.running
-
     def close_channel(self) -> None:
         """Close the sending direction; the engine then stops with a flat mirror."""
         with contextlib.suppress(OSError):
             self.connection.shutdown(socket.SHUT_WR)
 
-    def kill(self) -> None:
-        """Kill the engine; the fail-safe process then makes the mirror safe."""
-        self._process.kill()
-
     def close(self) -> bool:
         """Wait for both processes to end; true when the engine ended with a flat mirror."""
-        if not self._process.wait_or_kill(STOP_TIMEOUT_S):
+        if not self.process.wait_or_kill(STOP_TIMEOUT_S):
             log.error("the engine did not end within %g s and was killed", STOP_TIMEOUT_S)
-        self._failsafe.wait(STOP_TIMEOUT_S)
+        self.failsafe.wait(STOP_TIMEOUT_S)
         os.close(self._pipe_end)
         list(self.receive())
         self.connection.close()

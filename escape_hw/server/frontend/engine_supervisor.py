@@ -1,8 +1,9 @@
-"""Supervises the engine: starts it, applies the limits, kills it when it hangs, and reports its end."""
+"""Supervises the engine (start, limits, end), and holds the state that clients see."""
 
 from __future__ import annotations
 
 import logging
+import os
 import time
 from collections.abc import Callable
 from typing import Any
@@ -14,12 +15,33 @@ from escape_hw.errors import EscapeError
 from escape_hw.io.provenance import format_utc
 from escape_hw.remote.state import FaultState, Phase, State
 from escape_hw.server.frontend.engine_process import STOP_TIMEOUT_S, EngineProcess
-from escape_hw.server.frontend.published_state import PublishedState
+from escape_hw.server.frontend.lease import LeaseManager
+from escape_hw.server.frontend.transport import ZmqTransport
 from escape_hw.server.ipc.channel import EngineSetup
 from escape_hw.server.safety.journal import ServerJournal
 from escape_hw.server.safety.watchdog import Watchdog
 
 log = logging.getLogger(__name__)
+
+
+class PublishedState:
+    """Holds and publishes the state; its ``notes`` stay."""
+
+    def __init__(self, state: State, leases: LeaseManager, transport: ZmqTransport) -> None:
+        self.state, self._leases, self._transport = state, leases, transport
+
+    def update(self, state: State | None = None) -> None:
+        """Publish a new state of the engine, or the present one with new front-end values."""
+        before = self.state
+        self.state = (before if state is None else state).model_copy(
+            update={
+                "serial": before.serial + 1, "server_pid": os.getpid(), "lease": self._leases.lease,
+                "clients": self._leases.count, "refused_requests": self._transport.refused,
+                "notes": before.notes,
+            }
+        )  # fmt: skip
+        self._transport.publish("state", self.state)
+
 
 #: Seconds that an engine may be silent while its mirror is flat.
 IDLE_SILENCE_LIMIT_S = 120.0
@@ -58,12 +80,12 @@ class EngineSupervisor:
     def start(self) -> None:
         """Start an engine."""
         self._engine = EngineProcess(self._setup, str(self._journal.folder))
-        log.info("engine of %s: process %d", self._journal.system, self._engine.pid)
+        log.info("engine of %s: process %d", self._journal.system, self._engine.process.pid)
 
     @property
     def running_engine(self) -> EngineProcess | None:
         """The engine, ``None`` when there is none or it has died."""
-        return self._engine if self._engine is not None and self._engine.running else None
+        return self._engine if self._engine is not None and self._engine.process.running else None
 
     @property
     def has_ended(self) -> bool:
@@ -135,11 +157,11 @@ class EngineSupervisor:
             return
         engine.flush()
         # Read before the engine's own state: the fail-safe process ends only after its engine.
-        due, failsafe_is_running = now - self._last_heartbeat_s > _HEARTBEAT_S, engine.failsafe_is_running
+        due, failsafe_is_running = now - self._last_heartbeat_s > _HEARTBEAT_S, engine.failsafe.running
         if due:
             self._last_heartbeat_s = now
             engine.send({"heartbeat": True})
-        if not engine.running:
+        if not engine.process.running:
             self._on_engine_exit(engine)
             return
         if due:
@@ -160,7 +182,7 @@ class EngineSupervisor:
         if not self._kill_reason:
             self._kill_reason = reason
             log.error("%s; it is killed, and the fail-safe process makes the mirror safe", reason)
-            engine.kill()
+            engine.process.kill()
 
     def _on_engine_exit(self, engine: EngineProcess) -> None:
         """Report the end of the engine; called again until the fail-safe process has ended, too."""
@@ -170,14 +192,14 @@ class EngineSupervisor:
             engine.close()
             self._engine, self.stopping = None, True
             return
-        why = self._kill_reason or f"the engine (process {engine.pid}) died"
-        if engine.failsafe_is_running:
+        why = self._kill_reason or f"the engine (process {engine.process.pid}) died"
+        if engine.failsafe.running:
             if self._published.state.engine_pid:
                 self._publish_fault(f"{why}; the fail-safe process makes the mirror safe")
             return
         engine.close()
         self._engine, self._kill_reason = None, ""
-        report = self._journal.read_incident(engine.pid)
+        report = self._journal.read_incident(engine.process.pid)
         no_report = "the fail-safe process left no report; check the mirror"
         self._publish_fault(f"{why}; {no_report if report is None else report.mirror}")
         self.stopping = self._stop_requested_s is not None

@@ -22,20 +22,12 @@ MAX_CLIENTS = 200
 
 @dataclass(slots=True)
 class RegisteredClient:
-    """A client.
-
-    Parameters
-    ----------
-    registration
-        Its first request.
-    route
-        Identity of its connection, unknown to other clients.
-    last_message_s
-        Time of its last message, monotonic seconds.
-    """
+    """A client, by its first request."""
 
     registration: RegisterClient
+    #: Identity of its connection, unknown to other clients.
     route: bytes
+    #: Time of its last message, monotonic seconds.
     last_message_s: float
 
     @property
@@ -44,17 +36,14 @@ class RegisteredClient:
         r = self.registration
         return f"{r.name} on {r.host} (process {r.pid})"
 
+    def lease(self, since_utc: str) -> Lease:
+        """The lease of this client, for the state document."""
+        r = self.registration
+        return Lease(client=r.client, name=r.name, host=r.host, pid=r.pid, since_utc=since_utc)
+
 
 class LeaseManager:
-    """Registers clients and grants the lease.
-
-    Parameters
-    ----------
-    expiry_s
-        Silence after which the holder loses the lease.
-    clock
-        Monotonic seconds.
-    """
+    """Registers clients and grants the lease, which the holder loses after ``expiry_s`` of silence."""
 
     def __init__(self, expiry_s: float, clock: Callable[[], float] = time.monotonic) -> None:
         self.expiry_s, self._clock = expiry_s, clock
@@ -67,10 +56,7 @@ class LeaseManager:
     @property
     def lease(self) -> Lease | None:
         """The lease, for the state document."""
-        if self._holder is None:
-            return None
-        r = self._holder.registration
-        return Lease(client=r.client, name=r.name, host=r.host, pid=r.pid, since_utc=self._since)
+        return None if self._holder is None else self._holder.lease(self._since)
 
     @property
     def count(self) -> int:
@@ -115,10 +101,7 @@ class LeaseManager:
         if holder is not client:
             self._holder, self._since = client, format_utc()
         self.released_s = None
-        lease = self.lease
-        if lease is None:
-            raise RuntimeError("the lease that was just granted is missing")
-        return lease
+        return client.lease(self._since)
 
     def release(self, client: RegisteredClient) -> None:
         """Release the lease of a client; does nothing when it has none."""

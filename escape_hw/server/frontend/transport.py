@@ -56,11 +56,6 @@ class IncomingRequest:
 class ZmqTransport:
     """Receives requests, sends replies and publishes events, on one socket pair per call of :meth:`open`.
 
-    Parameters
-    ----------
-    context
-        ZeroMQ context.
-
     Attributes
     ----------
     refused
@@ -80,19 +75,9 @@ class ZmqTransport:
         return tuple(router for router, _ in self._socket_pairs)
 
     def open(self, *endpoints: Endpoint, keys: KeyPair | None = None) -> None:
-        """Listen on addresses.
+        """Listen on addresses (ConfigError: one is in use, or does not belong to this computer).
 
-        Parameters
-        ----------
-        endpoints
-            Addresses.
-        keys
-            Key pair of the server; with it, only clients with an allowed key get replies and events there.
-
-        Raises
-        ------
-        ConfigError
-            An address is in use, or does not belong to this computer.
+        With the server's ``keys``, only clients with an allowed key get replies and events there.
         """
         pair = (self._context.socket(zmq.ROUTER), self._context.socket(zmq.PUB))
         self._socket_pairs.append(pair)

@@ -32,28 +32,18 @@ _MAX_LINE_BYTES = 16 << 20
 
 
 class EngineSetup(BaseModel):
-    """Start-up settings of an engine, the first message from the front end.
-
-    Parameters
-    ----------
-    config_text
-        The system's configuration, TOML.
-    runs
-        Parent of the run folders.
-    read_folders
-        Further folders that products may be loaded from.
-    first_run_id
-        Number of the first run.
-    front_end_timeout_s
-        Silence of the front end after which the mirror is made safe.
-    """
+    """Start-up settings of an engine, the first message from the front end."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
+    #: The system's configuration, TOML.
     config_text: str
+    #: Parent of the run folders, and further folders that products may be loaded from.
     runs: Path
     read_folders: tuple[Path, ...]
+    #: Number of the first run.
     first_run_id: int = 1
+    #: Silence of the front end after which the mirror is made safe.
     front_end_timeout_s: float = 15.0
 
 
@@ -78,13 +68,7 @@ class MessageDecoder:
 
 
 class Channel:
-    """The engine's end of the connection. A thread sends the messages, so that no caller waits.
-
-    Parameters
-    ----------
-    connection
-        A connected socket.
-    """
+    """The engine's end of the connection. A thread sends the messages, so that no caller waits."""
 
     def __init__(self, connection: socket.socket) -> None:
         self._connection = connection

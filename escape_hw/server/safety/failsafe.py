@@ -28,49 +28,34 @@ _RETRY_PERIOD_S = 0.2
 
 
 class FailsafeSettings(BaseModel):
-    """Settings of the fail-safe process, read from its standard input.
-
-    Parameters
-    ----------
-    config_text
-        The system's configuration, TOML.
-    incidents
-        Folder of the reports.
-    pid, started
-        The engine's process, and its start time in clock ticks after boot.
-    """
+    """Settings of the fail-safe process, read from its standard input."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
+    #: The system's configuration, TOML.
     config_text: str
+    #: Folder of the reports.
     incidents: str
+    #: The engine's process, and its start time in clock ticks after boot.
     pid: int
     started: int
 
 
 class IncidentReport(BaseModel):
-    """Report of the fail-safe process after the death of an engine.
-
-    Parameters
-    ----------
-    mirror
-        State of the mirror, for people.
-    flat
-        Whether it is flat; ``None`` for a simulated mirror, which ended with its engine.
-    seconds
-        Time from the death of the engine to the report.
-    segments
-        Segments of shared memory that were removed.
-    """
+    """Report of the fail-safe process after the death of an engine."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     at_utc: str
     system: str
     pid: int
+    #: State of the mirror, for people.
     mirror: str
+    #: Whether it is flat; ``None`` for a simulated mirror, which ended with its engine.
     flat: bool | None
+    #: Time from the death of the engine to the report.
     seconds: float
+    #: Segments of shared memory that were removed.
     segments: tuple[str, ...] = ()
 
 
@@ -124,23 +109,19 @@ def _flatten(config: SystemConfig) -> tuple[bool | None, str]:
             time.sleep(_RETRY_PERIOD_S)
 
 
-def write_report(report: IncidentReport, folder: Path) -> Path:
-    """Write the report; the next start of the server shows it."""
-    folder.mkdir(parents=True, exist_ok=True)
-    path = folder / f"{report.system}-{report.pid}.incident.json"
-    temporary = path.with_suffix(".tmp")
-    temporary.write_text(report.model_dump_json(), encoding="utf-8")
-    temporary.replace(path)
-    return path
-
-
 def main() -> None:
     """Run the fail-safe process; ``argv`` holds the descriptor of the engine's pipe."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
     settings = FailsafeSettings.model_validate_json(sys.stdin.buffer.read())
     if not wait_for_end(int(sys.argv[1])):
-        write_report(make_safe(settings), Path(settings.incidents))
+        report, folder = make_safe(settings), Path(settings.incidents)
+        # The next start of the server shows it. Written also when the disk is nearly full.
+        folder.mkdir(parents=True, exist_ok=True)
+        path = folder / f"{report.system}-{report.pid}.incident.json"
+        temporary = path.with_suffix(".tmp")
+        temporary.write_text(report.model_dump_json(), encoding="utf-8")
+        temporary.replace(path)
 
 
 if __name__ == "__main__":

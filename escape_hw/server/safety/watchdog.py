@@ -25,17 +25,30 @@ class LimitViolation:
     remedy: str
 
 
+class _Duration:
+    """Seconds for which a condition has held in every state.
+
+    Gaps between states do not count towards the limits, since this process itself may have been delayed.
+    """
+
+    def __init__(self) -> None:
+        self._since: float | None = None
+
+    def update(self, holds: bool, now: float) -> float:
+        if not holds:
+            self._since = None
+        elif self._since is None:
+            self._since = now
+        return 0.0 if self._since is None else now - self._since
+
+
 class Watchdog:
     """Checks every state of the engine against the configured limits."""
 
     def __init__(self, limits: ServerSection, clock: Callable[[], float] = time.monotonic) -> None:
         self._limits, self._clock = limits, clock
         self._frames = -1
-        #: Start times of conditions that hold in every state since. Gaps between states do not count
-        #: towards the limits, since this process itself may have been delayed.
-        self._no_frames_since: float | None = None
-        self._clipped_since: float | None = None
-        self._diverging_since: float | None = None
+        self._no_frames, self._clipped, self._diverging = _Duration(), _Duration(), _Duration()
         #: Times and residuals in nm.
         self._residuals: deque[tuple[float, float]] = deque()
         #: Identity of the closed loop: closed, run, and count of flattenings. A run may open and close the
@@ -51,17 +64,13 @@ class Watchdog:
         if loop != self._loop:
             self._loop = loop
             self._residuals.clear()
-            self._no_frames_since = self._clipped_since = self._diverging_since = None
+            self._no_frames, self._clipped, self._diverging = _Duration(), _Duration(), _Duration()
         return self._check_frames(state) or self._check_saturation(state) or self._check_divergence(state)
 
     def _check_frames(self, state: State) -> LimitViolation | None:
         now, limit = self._clock(), self._limits.no_frames_s
-        if state.rates.frames != self._frames or not state.loop.closed:
-            self._frames, self._no_frames_since = state.rates.frames, None
-            return None
-        if self._no_frames_since is None:
-            self._no_frames_since = now
-        silent = now - self._no_frames_since
+        silent = self._no_frames.update(state.loop.closed and state.rates.frames == self._frames, now)
+        self._frames = state.rates.frames
         if silent <= limit:
             return None
         return LimitViolation(
@@ -71,16 +80,12 @@ class Watchdog:
 
     def _check_saturation(self, state: State) -> LimitViolation | None:
         now, limit, max_share = self._clock(), self._limits.saturated_s, self._limits.saturated_fraction
-        if not state.loop.closed or state.mirror.saturated_share <= max_share:
-            self._clipped_since = None
-            return None
-        if self._clipped_since is None:
-            self._clipped_since = now
-        if now - self._clipped_since <= limit:
+        clipped_s = self._clipped.update(state.loop.closed and state.mirror.saturated_share > max_share, now)
+        if clipped_s <= limit:
             return None
         return LimitViolation(
             f"{100 * state.mirror.saturated_share:.0f} % of the actuators at their limits for "
-            f"{now - self._clipped_since:.1f} s (limit {100 * max_share:.0f} % for {limit:g} s)",
+            f"{clipped_s:.1f} s (limit {100 * max_share:.0f} % for {limit:g} s)",
             "Lower the gain, use another matrix, or wait for better seeing; then clear the fault.",
         )
 
@@ -100,12 +105,8 @@ class Watchdog:
         present = statistics.median(residual for at, residual in samples if now - at < _RECENT_S)
         baseline = statistics.median(baseline_residuals)
         factor, limit = self._limits.diverging_factor, self._limits.diverging_s
-        if present <= factor * baseline:
-            self._diverging_since = None
-            return None
-        if self._diverging_since is None:
-            self._diverging_since = now
-        if now - self._diverging_since < limit:
+        diverges = present > factor * baseline
+        if self._diverging.update(diverges, now) < limit or not diverges:
             return None
         return LimitViolation(
             f"the residual grew to {present:.0f} nm, {present / baseline:.1f} times its median of "

@@ -40,10 +40,8 @@ class TurbulentLayer:
 
     Parameters
     ----------
-    source
-        Draws the realisations, in radians.
-    scale
-        Factor from radians to the unit of the output.
+    source, scale
+        Draws the realisations, in radians; factor from radians to the unit of the output.
     wind_m_s
         Wind velocity (x, y) over the pupil in metres per second; x along columns, y along rows.
     boiling_s
@@ -51,8 +49,6 @@ class TurbulentLayer:
         shortened where needed so that no realisation outlasts the wind's way across the screen.
     lit
         Samples ``(n, n)`` of the pupil that need values.
-    seed
-        Seed of this layer.
     executor
         Draws the next realisation in advance; None draws it when needed. The result is the same.
 
@@ -92,11 +88,6 @@ class TurbulentLayer:
         )
         self._drawn: dict[int, TurbulenceRealisation] = {}
         self._pending: dict[int, Future[TurbulenceRealisation]] = {}
-
-    @property
-    def boiling_s(self) -> float:
-        """Actual time in seconds after which the correlation has fallen to 1/e."""
-        return _DECAY_ANGLE / self.rate if self.rate else math.inf
 
     def add(self, time_s: float, out: NDArray[np.float32], strength: float = 1.0) -> None:
         """Add ``strength`` times the layer at time ``time_s`` to ``out (n, n)``."""
@@ -170,18 +161,7 @@ class Atmosphere:
 
     The optical path is the same at all wavelengths. The Fried parameter is given at 500 nm.
 
-    Parameters
-    ----------
-    settings
-        Strength, outer scale, layers and boiling.
-    pixel_m
-        Size of a pupil sample in metres.
-    lit
-        Samples ``(n, n)`` of the pupil that need values.
-    seed
-        Seed; each layer has its own stream.
-    background
-        Draw the next screens in a thread. The turbulence is the same either way.
+    Each layer has its own stream of ``seed``. Only the ``lit`` samples ``(n, n)`` get values.
     """
 
     def __init__(
@@ -190,13 +170,11 @@ class Atmosphere:
         pixel_m: float,
         lit: NDArray[np.bool_],
         seed: np.random.SeedSequence,
-        *,
-        background: bool = True,
     ) -> None:
         n = lit.shape[0]
         source = TurbulenceSource(screen_pixels(n), pixel_m, settings.r0_m, settings.outer_scale_m, n + 3)
-        threaded = background and helper_threads_allowed()
-        executor = ThreadPoolExecutor(1, thread_name_prefix="atmosphere") if threaded else None
+        # The next screens are drawn in a thread; the turbulence is the same without.
+        executor = ThreadPoolExecutor(1, "atmosphere") if helper_threads_allowed() else None
         self.layers: list[TurbulentLayer] = []
         for number, (fraction, speed, direction) in enumerate(
             zip(settings.fraction, settings.speed_m_s, settings.direction_deg, strict=True)

@@ -20,22 +20,10 @@ if TYPE_CHECKING:
 def von_karman_screen(
     size: int, pixel_m: float, r0_m: float, outer_scale_m: float, rng: np.random.Generator
 ) -> NDArray[np.float32]:
-    """Draw a periodic screen of von Karman turbulence.
+    """Draw the phase ``(size, size)`` in radians of a periodic screen, with zero mean.
 
-    Parameters
-    ----------
-    size, pixel_m
-        Pixels across and pixel size in metres. The screen contains no structure larger than itself, so
-        ``size * pixel_m`` should be several outer scales.
-    r0_m, outer_scale_m
-        Fried parameter, at the wavelength of the phase, and outer scale in metres.
-    rng
-        Source of randomness.
-
-    Returns
-    -------
-    ndarray of float32, ``(size, size)``
-        Phase in radians with zero mean.
+    The screen contains no structure larger than itself, so ``size * pixel_m`` should be several outer
+    scales. Other parameters as for :class:`~escape_sim.atmosphere.von_karman.TurbulenceSource`.
     """
     f = np.fft.fftfreq(size, pixel_m)
     f2 = f[:, None] ** 2 + f[None, : size // 2 + 1] ** 2
@@ -82,10 +70,8 @@ class RotatingScreen:
     ----------
     opd_m
         Optical path difference of the plate ``(size, size)`` in metres, size a power of two.
-    pixel_m
-        Pixel size of plate and pupil in metres.
-    radius_m
-        Distance of the pupil's centre from the axis in metres.
+    pixel_m, radius_m
+        Pixel size of plate and pupil, and distance of the pupil's centre from the axis, in metres.
     lit
         Samples ``(n, n)`` of the pupil that need values; others are not written.
 
@@ -132,19 +118,8 @@ _MAX_CACHED_PLATES = 3
 class PhasePlates:
     """Changer of rotating phase plates; adds nothing in a system without plates.
 
-    Parameters
-    ----------
-    config
-        Plates of the system (``devices.screen``).
-    pupil
-        The sampled pupil.
-    seed
-        Seed; each plate has its own stream, so the order of use does not matter.
-
-    Attributes
-    ----------
-    number, inserted
-        Selected plate, and whether it is in the beam.
+    Each plate has its own stream of ``seed``, so the order of use does not matter. ``number`` is the
+    selected plate, ``inserted`` whether it is in the beam.
     """
 
     def __init__(self, config: SystemConfig, pupil: PupilGeometry, seed: np.random.SeedSequence) -> None:

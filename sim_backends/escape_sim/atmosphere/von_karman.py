@@ -62,12 +62,7 @@ def spline_gain(frequency: NDArray[np.floating]) -> NDArray[np.float64]:
     A spline through given values loses power between the pixels, up to all of it at the highest
     frequency. The gain makes the power right in the mean over all positions, which is what a drifting
     screen shows. Without it a spline loses 3 % of the power at half the highest frequency (linear
-    interpolation a third) and half of it at the highest.
-
-    Parameters
-    ----------
-    frequency
-        Frequencies in cycles per pixel, any shape.
+    interpolation a third) and half of it at the highest. ``frequency`` is in cycles per pixel.
     """
     position = (np.arange(_N_POSITIONS) + 0.5) / _N_POSITIONS
     weights = spline_weights(position)
@@ -152,18 +147,12 @@ def _cell_power(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TurbulenceRealisation:
-    """One realisation of a turbulent layer.
+    """One realisation of a turbulent layer."""
 
-    Parameters
-    ----------
-    coefficients
-        Cubic B-spline coefficients of the periodic screen ``(size, size + margin)`` in radians. The
-        first ``margin`` columns are repeated at the end, so that a pupil never wraps around.
-    waves
-        Complex amplitudes ``(n_waves,)`` in radians of the waves longer than the screen.
-    """
-
+    #: Cubic B-spline coefficients of the periodic screen ``(size, size + margin)`` in radians. The first
+    #: ``margin`` columns are repeated at the end, so that a pupil never wraps around.
     coefficients: NDArray[np.float32]
+    #: Complex amplitudes ``(n_waves,)`` in radians of the waves longer than the screen.
     waves: NDArray[np.complex128]
 
 
@@ -172,10 +161,8 @@ class TurbulenceSource:
 
     Parameters
     ----------
-    size
-        Pixels across the periodic screen, a power of two.
-    pixel_m
-        Pixel size in metres.
+    size, pixel_m
+        Pixels across the periodic screen, a power of two, and their size in metres.
     r0_m, outer_scale_m
         Fried parameter, at the wavelength of the phase, and outer scale in metres.
     margin

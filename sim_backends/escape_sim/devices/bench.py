@@ -22,11 +22,12 @@ from escape_sim.mirror.influence_functions import (
     read_influence_functions,
 )
 from escape_sim.mirror.surface import DriftingSurface, Flexure, InfluenceModel
+from escape_sim.optics.base import ModulatedOptics, SensorOptics
 from escape_sim.optics.detector import Detector
 from escape_sim.optics.focal_plane import FocalPlane
 from escape_sim.optics.modulation import BeamPath
 from escape_sim.optics.pupil import contaminated_pupil, pupil_geometry
-from escape_sim.optics.sensor import ModulatedOptics, SensorOptics, make_sensor_optics
+from escape_sim.optics.sensor import make_sensor_optics
 
 if TYPE_CHECKING:
     from escape_hw.config.devices import ScienceConfig

@@ -21,20 +21,14 @@ class GaussianFactors:
     With ``X_0 = exp(-u^2 / 2)``, ``u = (x - x_a) / s_x``, the derivative of a factor by the actuator's
     position is ``X_1 = X_0 u / s_x`` and by the logarithm of its width ``X_2 = X_0 u^2``.
 
-    Parameters
-    ----------
-    along_x, along_y
-        ``(3, n_x, n_act)`` and ``(3, n_y, n_act)``: ``X_0, X_1, X_2`` and the same along y.
-    position
-        Derivatives of the actuator positions ``(6, 2, n_act)`` as (x, y), in metres per unit of the
-        parameter.
-    log_width
-        Derivatives of the logarithm of the widths along x and y ``(6, 2)``.
     """
 
+    #: ``X_0, X_1, X_2`` ``(3, n_x, n_act)``, and the same along y ``(3, n_y, n_act)``.
     along_x: NDArray[np.floating]
     along_y: NDArray[np.floating]
+    #: Derivatives of the actuator positions ``(6, 2, n_act)`` as (x, y), metres per unit of the parameter.
     position: NDArray[np.floating]
+    #: Derivatives of the logarithm of the widths along x and y ``(6, 2)``.
     log_width: NDArray[np.floating]
 
 
@@ -48,16 +42,8 @@ def gaussian_factors(
 ) -> GaussianFactors:
     """Factors of influence functions without a wing, and of their derivatives.
 
-    Parameters
-    ----------
-    influence
-        The influence functions; the gain is contained in the factors along y.
-    registration, sub_aperture_m
-        Registration and the size of a sub-aperture in metres that its shifts refer to.
-    x_m, y_m
-        Columns' and rows' coordinates ``(n_x,)`` and ``(n_y,)`` in metres.
-    dtype
-        Precision of the factors; single precision gives 1e-6 of a surface.
+    The grid is given as for :meth:`InfluenceFunctions.factors`. The gain is contained in the factors along
+    y. Single precision gives 1e-6 of a surface.
 
     Raises
     ------
@@ -154,7 +140,7 @@ def surface_nodes(
     """Interpolation nodes along an axis, and the matrix from their values to values at the samples.
 
     Chebyshev nodes with barycentric interpolation (Berrut and Trefethen 2004), or the samples
-    themselves if these are fewer.
+    themselves, with None for the matrix, if these are fewer.
 
     Parameters
     ----------
@@ -165,9 +151,7 @@ def surface_nodes(
 
     Returns
     -------
-    nodes_m : ndarray, ``(m,)``
-    interpolation : ndarray, ``(n, m)``
-        None if the nodes are the samples.
+    nodes_m, interpolation : ndarray, ``(m,)`` and ``(n, m)``
     """
     centre, half = (samples_m[0] + samples_m[-1]) / 2, (samples_m[-1] - samples_m[0]) / 2
     m = int(np.ceil(_NODES_PER_SIGMA * half / sigma_m)) + 1

@@ -26,10 +26,6 @@ AMBIENT_C, RISE_C_PER_A = 15.0, 10.0
 class MovingActuators(Protocol):
     """Actuators that follow shapes ``(n_act,)``, fractions of full stroke, in time."""
 
-    @property
-    def now_s(self) -> float:
-        """Monotonic seconds."""
-
     def drive(self, shape: NDArray[np.float64]) -> None:
         """Command a shape, with the latency of commands."""
 
@@ -44,46 +40,25 @@ class RealTimeActuators:
     """Actuators that move in real time and settle within 5 % of a step in ``settling_s`` seconds."""
 
     def __init__(self, n_act: int, settling_s: float) -> None:
-        self._start = time.monotonic()
+        self._start_s = time.monotonic()
         self._dynamics = MirrorDynamics(n_act, settling_s, 0.0, 1.0)
-
-    @property
-    def now_s(self) -> float:
-        """Seconds since construction."""
-        return time.monotonic() - self._start
 
     def drive(self, shape: NDArray[np.float64]) -> None:
         """Command a shape now."""
-        self._dynamics.command(self.now_s, shape)
+        self._dynamics.command(time.monotonic() - self._start_s, shape)
 
     set_positions = drive
 
     def positions(self) -> NDArray[np.float64]:
         """Present positions."""
-        now = self.now_s
-        return self._dynamics.mean(now, now)
+        now_s = time.monotonic() - self._start_s
+        return self._dynamics.mean(now_s, now_s)
 
 
 class Shell:
     """State, fault and sensors of a shell on moving actuators.
 
-    Parameters
-    ----------
-    actuators
-        The actuators.
-    n_act
-        Their number.
-    stroke_m
-        Metres of surface for a command of 1.
-    noise
-        Random generator of the position sensors.
-
-    Attributes
-    ----------
-    unreadable
-        Actuators whose position sensor fails.
-    excess_a
-        Coil current in amperes of actuators that draw too much.
+    ``stroke_m`` are the metres of surface for a command of 1; ``noise`` is that of the position sensors.
     """
 
     def __init__(
@@ -91,7 +66,9 @@ class Shell:
     ) -> None:
         self._actuators, self.n_act, self.stroke_m, self._noise = actuators, n_act, stroke_m, noise
         self.state, self.fault = ShellState.OFF, ""
+        #: Actuators whose position sensor fails.
         self.unreadable: set[int] = set()
+        #: Coil current in amperes of actuators that draw too much.
         self.excess_a: dict[int, float] = {}
 
     @property
@@ -120,11 +97,9 @@ class Shell:
     def measure_positions(self) -> NDArray[np.float64]:
         """Noisy positions ``(n_act,)``, fractions of full stroke; NaN for unreadable sensors."""
         positions = self._actuators.positions()
-        noise = self._noise.standard_normal(positions.size) * (SENSOR_NOISE_M / self.stroke_m)
-        measured_positions = positions + noise
-        if self.unreadable:
-            measured_positions[sorted(self.unreadable)] = np.nan
-        return measured_positions
+        measured = positions + self._noise.standard_normal(positions.size) * (SENSOR_NOISE_M / self.stroke_m)
+        measured[sorted(self.unreadable)] = np.nan
+        return measured
 
     def gap_m(self) -> float:
         """Mean gap in metres."""

@@ -41,16 +41,8 @@ def make_mirror_surface(
     """Build the fastest surface function for these influence functions.
 
     One matrix product over all actuators is fastest if each reaches across much of the pupil; with
-    many actuators it is faster to add each on the samples that it reaches.
-
-    Parameters
-    ----------
-    influence
-        Gaussian or measured influence functions.
-    registration, sub_aperture_m
-        Registration and the size of a sub-aperture in metres that its shifts refer to.
-    x_m, y_m
-        Columns' and rows' coordinates ``(n_x,)`` and ``(n_y,)`` in metres.
+    many actuators it is faster to add each on the samples that it reaches. Registration and grid are given
+    as for :meth:`InfluenceFunctions.factors`.
     """
     if not isinstance(influence, InfluenceFunctions):
         return GriddedSurface(influence.surfaces(registration, sub_aperture_m, x_m, y_m))

@@ -14,15 +14,8 @@ from escape_hw.api.registration import Registration
 from escape_hw.calibration.modes.bases import build_basis
 from escape_hw.config.sensor import PyramidSection
 from escape_sim.atmosphere.von_karman import structure_function
-from escape_sim.mirror.influence_functions import InfluenceFunctions, nominal_influence_functions
-from escape_sim.mirror.mode_surfaces import (
-    N_DERIVATIVES,
-    GaussianFactors,
-    gaussian_factors,
-    mode_derivatives,
-    mode_surfaces,
-    surface_nodes,
-)
+from escape_sim.mirror.mode_surfaces import N_DERIVATIVES, mode_derivatives, mode_surfaces, surface_nodes
+from escape_sim.models.base import DesignModel
 from escape_sim.models.pyramid_response import slope_response
 from escape_sim.models.pyramid_turbulence import (
     PokePhase,
@@ -75,7 +68,7 @@ def nominal_pupils(config: SystemConfig) -> PyramidPupils:
     )  # fmt: skip
 
 
-class PyramidModel:
+class PyramidModel(DesignModel):
     """Small-signal slopes of a modulated pyramid with a mirror of Gaussian actuators.
 
     The derivatives of the slopes by the phase are computed once, at a flat wavefront or averaged over
@@ -86,8 +79,6 @@ class PyramidModel:
 
     Parameters
     ----------
-    config
-        The design: sensor, mirror and beam. Its ``twin`` section is not read.
     pupils
         The pupil images measured on the camera.
     modulation
@@ -115,9 +106,8 @@ class PyramidModel:
         basis: NDArray[np.float64] | None = None,
     ) -> None:
         pupil = pupil_from_images(config, pupils)
-        self._config, self._pupils, self._pupil = config, pupils, pupil
-        self._nominal = nominal_influence_functions(config)
-        self._modes = basis
+        super().__init__(config, pupil)
+        self._pupils, self._modes = pupils, basis
         self._modulation = modulation or ModulationPath.circle(pupils.modulation)
         # The optical path changes by twice the surface.
         scale = 2 * config.devices.dm.stroke_m * 2 * np.pi / config.system.wavelength_m
@@ -133,16 +123,6 @@ class PyramidModel:
         self._variants: list[PyramidModel] | None = None
         self._shifted_models: dict[tuple[float, float], PyramidModel] = {}
         self._turbulence_scatter: NDArray[np.float64] | None = None
-
-    @property
-    def n_act(self) -> int:
-        """Number of actuators."""
-        return self._nominal.n_act
-
-    @property
-    def sub_aperture_m(self) -> float:
-        """Size of a pixel of the pupil image in metres."""
-        return self._pupil.sub_aperture_m
 
     @property
     def registration_systematic_error(self) -> NDArray[np.float64]:
@@ -170,31 +150,27 @@ class PyramidModel:
 
     def influence_functions(self) -> tuple[NDArray[np.float64], NDArray[np.bool_], float]:
         """Nominal influence functions for the modal basis, see :class:`SyntheticModel`."""
-        x = self._pupil.coordinates_m
-        surfaces = self._influence(1.0).surfaces(Registration(), self.sub_aperture_m, x, x)
-        return surfaces, self._pupil.lit, self._pupil.pixel_m
+        return self._surfaces(self._pupil.coordinates_m), self._pupil.lit, self._pupil.pixel_m
 
     def zonal_matrix(self, registration: Registration, width: float = 1.0) -> NDArray[np.float64]:
         """Slopes per unit command ``(n_slopes, n_act)``, see :class:`SyntheticModel`; single precision."""
         if registration.anamorphosis_angle:
             # An inclined elliptic Gaussian is not separable in x and y.
-            at = self._nodes
-            surfaces = self._influence(width).surfaces(registration, self.sub_aperture_m, at, at)
-            return self._slopes(np.moveaxis(surfaces, 0, 2))
-        factors = self._factors(registration, width)
+            return self._slopes(np.moveaxis(self._surfaces(self._nodes, registration, width), 0, 2))
+        factors = self._factors(self._nodes, registration, width)
         return self._slopes(np.einsum("ya,xa->yxa", factors.along_y[0], factors.along_x[0]))
 
     def modal_matrix(
         self, registration: Registration, m2c: NDArray[np.float64], width: float = 1.0
     ) -> NDArray[np.float64]:
         """Slopes per unit mode ``(n_slopes, n_modes)``, see :class:`DifferentiableModel`."""
-        return self._slopes(mode_surfaces(self._factors(registration, width), m2c))
+        return self._slopes(mode_surfaces(self._factors(self._nodes, registration, width), m2c))
 
     def modal_jacobian(
         self, registration: Registration, m2c: NDArray[np.float64], width: float = 1.0
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Modal matrix and its derivatives, see :class:`DifferentiableModel`."""
-        surfaces = mode_derivatives(self._factors(registration, width), m2c)
+        surfaces = mode_derivatives(self._factors(self._nodes, registration, width), m2c)
         parts = self._slopes(surfaces.reshape(*surfaces.shape[:2], -1))
         parts = parts.reshape(-1, 1 + N_DERIVATIVES, m2c.shape[1]).transpose(1, 0, 2)
         return parts[0], parts[1:]
@@ -203,7 +179,7 @@ class PyramidModel:
         self, registration: Registration, width: float = 1.0
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Zonal matrix and its derivatives, see :class:`DifferentiableModel`."""
-        factors = self._factors(registration, width)
+        factors = self._factors(self._nodes, registration, width)
         x, y = factors.along_x, factors.along_y
         pairs = ((0, 0), (1, 0), (0, 1), (2, 0), (0, 2))
         parts = [self._slopes(np.einsum("ya,xa->yxa", y[j], x[i])) for i, j in pairs]
@@ -219,34 +195,38 @@ class PyramidModel:
         if position not in self._shifted_models:
             shift_px = np.array(position) / 100 * self._pupils.diameter_px / self._pupil.n_sub
             pupils = replace(self._pupils, centres_px=self._pupils.centres_px + shift_px)
-            self._shifted_models[position] = self._variant_with(self._modulation, self.turbulence, pupils)
+            self._shifted_models[position] = self._variant(pupils=pupils)
         return self._shifted_models[position]
 
     def variants(self) -> list[PyramidModel]:
         """Models with stronger turbulence, elliptic modulation, or displaced images."""
         if self._variants is None:
-            radius = self._pupils.modulation
-            self._variants = []
+            changes: list[PyramidModel] = []
             if self.turbulence:
-                stronger = self.turbulence * (1 + _STRENGTH_UNCERTAINTY)
-                self._variants.append(self._variant_with(self._modulation, stronger))
+                changes.append(self._variant(turbulence=self.turbulence * (1 + _STRENGTH_UNCERTAINTY)))
+            radius = self._pupils.modulation
             for angle in (0.0, np.pi / 4) if radius else ():
                 elliptic = ModulationPath.circle(radius, ellipse=_ELLIPSE, ellipse_angle=angle)
-                self._variants.append(self._variant_with(elliptic, self.turbulence))
+                changes.append(self._variant(modulation=elliptic))
             for axis in range(2):
                 centres = self._pupils.centres_px.copy()
                 centres[:, axis] += _IMAGE_POSITION_ERROR_PX * _DIAGONALS
-                displaced = replace(self._pupils, centres_px=centres)
-                self._variants.append(self._variant_with(self._modulation, self.turbulence, displaced))
+                changes.append(self._variant(pupils=replace(self._pupils, centres_px=centres)))
+            self._variants = changes
         return list(self._variants)
 
     # ------------------------------------------------------------------ construction
-    def _variant_with(
-        self, modulation: ModulationPath, turbulence: float, pupils: PyramidPupils | None = None
+    def _variant(
+        self,
+        *,
+        pupils: PyramidPupils | None = None,
+        modulation: ModulationPath | None = None,
+        turbulence: float | None = None,
     ) -> PyramidModel:
+        """The same model, except for what is given."""
         return PyramidModel(
-            self._config, pupils or self._pupils, modulation=modulation, turbulence=turbulence,
-            basis=self._modes,
+            self._config, pupils or self._pupils, modulation=modulation or self._modulation,
+            turbulence=self.turbulence if turbulence is None else turbulence, basis=self._modes,
         )  # fmt: skip
 
     def _turbulence_uncertainty(self) -> NDArray[np.float64]:
@@ -254,13 +234,12 @@ class PyramidModel:
         if not self._pupils.n_effective or not (self.turbulence or self._pokes):
             return np.zeros(5)
         if self._turbulence_scatter is None:
-            x, optics = self._pupil.coordinates_m, self.optics()
+            optics, x = self.optics(), self._pupil.coordinates_m
             screens = unit_screens(x.size, _OUTER_SCALE) * self.turbulence ** (5 / 6)
             phases = np.repeat(screens[:, None], _N_SHAPES, axis=1)
             if self._pokes:
                 phases += self._pokes.phases(screens.shape[0] * _N_SHAPES).reshape(phases.shape)
-            paths = self._influence(1.0).surfaces(Registration(), self.sub_aperture_m, x, x)
-            paths *= 2 * self._config.devices.dm.stroke_m
+            paths = self._surfaces(x) * (2 * self._config.devices.dm.stroke_m)
             self._turbulence_scatter = turbulence_registration_scatter(
                 optics, self._pupils, phases, self._draw_commands(len(screens)), paths,
                 lambda m2c: self.modal_jacobian(Registration(), m2c),
@@ -326,11 +305,3 @@ class PyramidModel:
         half = len(self._response) // 2
         second = self._executor.submit(np.matmul, self._response[half:], surface_matrix)
         return np.concatenate([self._response[:half] @ surface_matrix, second.result()]).astype(np.float64)
-
-    def _factors(self, registration: Registration, width: float) -> GaussianFactors:
-        return gaussian_factors(
-            self._influence(width), registration, self.sub_aperture_m, self._nodes, self._nodes
-        )
-
-    def _influence(self, width: float) -> InfluenceFunctions:
-        return replace(self._nominal, width=width)

@@ -40,11 +40,11 @@ class ModulatedCorrelations:
         at = np.arange(n) - (n - 1) / 2
         x, y = modulation.points.T[:, :, None, None] / prism.diameter
         tilts = np.exp(2j * np.pi * (y * at[:, None] + x * at))
-        tilts *= np.sqrt(modulation.weights)[:, None, None]
+        tilts *= np.sqrt(modulation.weight)
         # The frequencies are half-integers, those of the transform integers.
         carrier = np.exp(-2j * np.pi * frequencies(n_grid)[0] * np.arange(n_grid))
         prism_filter = FourierFilter(prism.mask(n_grid) / n_grid**2, n, n_grid)
-        self._fields = np.empty((n_grid, n_grid, modulation.n_points), np.complex64)
+        self._fields = np.empty((n_grid, n_grid, len(modulation.points)), np.complex64)
         for k, tilt in enumerate(tilts):
             prism_filter.field[:, :n] = light * tilt * np.outer(carrier[:n], carrier[:n])
             prism_filter.run()
@@ -62,8 +62,8 @@ class TurbulentCorrelations:
     """Correlations of a modulation under turbulence: one convolution with the coherence per pixel.
 
     ``light`` is the pupil amplitude ``(n, n)``, ``kernel`` the point response from :func:`_prism_kernel`,
-    ``mean`` the :func:`coherence`, to which ``variation`` is added where the phase varies more. Not
-    thread-safe.
+    ``mean`` the :func:`coherence`. For phases that vary more in parts of the pupil, ``half_share (n, n)`` is
+    half the weight of ``difference``, which is added to the coherence there. Not thread-safe.
     """
 
     def __init__(
@@ -71,43 +71,29 @@ class TurbulentCorrelations:
         light: NDArray[np.float32],
         kernel: NDArray[np.complex64],
         mean: NDArray[np.complex128],
-        variation: CoherenceVariation | None = None,
+        half_share: NDArray[np.float32] | None = None,
+        difference: NDArray[np.complex128] | None = None,
     ) -> None:
         self._filter = _convolution(mean, len(light))
-        self._light, self._kernel, self._variation = light, kernel, variation
-        self._variation_filter = None if variation is None else _convolution(variation.difference, len(light))
+        self._light, self._kernel, self._half_share = light, kernel, half_share
+        self._difference_filter = None if difference is None else _convolution(difference, len(light))
 
     def correlations(self, pixels: NDArray[np.intp]) -> Iterator[NDArray[np.complex64]]:
         """Yield ``n`` rows of ``n`` or more samples for each (row, column) ``u`` in ``pixels``."""
-        n, filter_, variation_filter = len(self._light), self._filter, self._variation_filter
+        n, filter_, difference = len(self._light), self._filter, self._difference_filter
         for row, column in pixels:
             _shifted_kernel(self._kernel, n - 1 + row, n - 1 + column, self._light, filter_.field)
             filter_.run()
-            result = filter_.result[:n, :n]
-            if variation_filter is not None and self._variation is not None:
+            if difference is not None and self._half_share is not None:
+                result = filter_.result[:n, :n]
                 # With s(p, q) = (s(p) + s(q)) / 2, half the share is on either side of the convolution.
-                half_share = self._variation.half_share
-                variation_filter.field[:n, :n] = filter_.field[:n, :n]
-                variation_filter.run()
-                result += half_share * variation_filter.result[:n, :n]
-                variation_filter.field[:n, :n] *= half_share
-                variation_filter.run()
-                result += variation_filter.result[:n, :n]
+                difference.field[:n, :n] = filter_.field[:n, :n]
+                difference.run()
+                result += self._half_share * difference.result[:n, :n]
+                difference.field[:n, :n] *= self._half_share
+                difference.run()
+                result += difference.result[:n, :n]
             yield filter_.result
-
-
-PixelCorrelations = ModulatedCorrelations | TurbulentCorrelations
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class CoherenceVariation:
-    """Coherence interpolated between two: half the weight of the second, and its difference to the first.
-
-    ``half_share`` is ``(n, n)`` and ``difference`` ``(2 n - 1, 2 n - 1)``, see :func:`coherence`.
-    """
-
-    half_share: NDArray[np.float32]
-    difference: NDArray[np.complex128]
 
 
 def _convolution(kernel: NDArray[np.complex128], n: int) -> FourierFilter:
@@ -124,20 +110,13 @@ def coherence(
 ) -> NDArray[np.complex128]:
     """Mean of ``exp(i (phi(p) - phi(q)))`` over modulation and turbulence ``(2 n - 1, 2 n - 1)``.
 
-    Parameters
-    ----------
-    n, diameter
-        Samples across the pupil's array, and pupil diameter in samples.
-    modulation
-        Path of the image over the pyramid.
-    structure
-        Structure function ``(2 n - 1, 2 n - 1)`` of the turbulence in rad^2, at distances ``p - q`` from
-        ``-(n - 1)`` to ``n - 1`` samples along y and x.
+    ``n`` and ``diameter`` are the samples across the pupil's array and across the pupil; ``structure`` is as
+    for :func:`slope_response`.
     """
     steps = np.arange(1 - n, n)
     x, y = (np.exp(2j * np.pi * np.outer(steps, t) / diameter) for t in modulation.points.T)
     # Characteristic function of a Gaussian phase.
-    return np.asarray((y * modulation.weights) @ x.T * np.exp(-0.5 * structure))
+    return np.asarray((y * modulation.weight) @ x.T * np.exp(-0.5 * structure))
 
 
 #: Threads that share the pixels.
@@ -172,12 +151,8 @@ def _add_pixel_response(kernel, row, column, light, correlations, spans, weights
 class NonuniformPhase:
     """Gaussian phases whose variance depends on the position in the pupil.
 
-    Parameters
-    ----------
-    structure
-        Mean structure function ``(2 n - 1, 2 n - 1)`` in rad^2.
-    strength
-        Factor ``(n, n)`` on it at each sample, 1 on average.
+    ``structure`` is their mean structure function ``(2 n - 1, 2 n - 1)`` in rad^2, ``strength (n, n)`` the
+    factor on it at each sample, 1 on average.
     """
 
     structure: NDArray[np.float64]
@@ -186,14 +161,9 @@ class NonuniformPhase:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SlopeResponse:
-    """Slopes of a flat wavefront and their derivatives by the phase.
+    """Slopes of a flat wavefront ``flat (n_slopes,)``, all x then all y, and their derivatives.
 
-    Parameters
-    ----------
-    flat
-        Slopes ``(n_slopes,)``, all x then all y.
-    phase_derivatives
-        Derivatives ``(n_slopes, m * m)`` in 1 / rad, by the phase at the nodes, rows along y.
+    ``phase_derivatives (n_slopes, m * m)`` are by the phase at the nodes, rows along y, in 1 / rad.
     """
 
     flat: NDArray[np.float64]
@@ -227,10 +197,8 @@ def slope_response(
     ----------
     amplitude
         Pupil amplitude ``(n, n)``.
-    prism
-        Faces, for a pupil in the grid's corner.
-    n_grid
-        Side of the periodic grid in samples.
+    prism, n_grid
+        Faces, for a pupil in the grid's corner, and side of the periodic grid in samples.
     corners
         First camera pixel ``(4, 2)`` as (x, y) of each image's box, from the grid's corner.
     valid
@@ -256,125 +224,112 @@ def slope_response(
         The boxes leave the grid.
     """
     light = np.ascontiguousarray(amplitude, dtype=np.float32)
-    pixels_xy = np.argwhere(valid)
-    first_samples = (corners[:, None, ::-1] + pixels_xy) * samples
+    first_samples = (corners[:, None, ::-1] + np.argwhere(valid)) * samples
     if first_samples.min() < 0 or first_samples.max() + samples > n_grid:
         raise ValueError("the pupil images leave the periodic grid; enlarge the camera region")
-    m = len(light) if interpolation is None else interpolation.shape[1]
-    sums = _Sums(
-        np.empty((2, len(pixels_xy), m, m), np.float32),
-        np.zeros((3, len(pixels_xy))),
-        np.zeros((len(pixels_xy) if local else _WORKERS, m, m), np.float32),
-    )
     kernel = _prism_kernel(prism, len(light), n_grid)
-    correlations: list[PixelCorrelations]
+    correlations: list[ModulatedCorrelations] | list[TurbulentCorrelations]
     if structure is None:
         correlations = [ModulatedCorrelations(light, prism, n_grid, modulation)] * _WORKERS
     else:
-        mean, variation = _mean_and_varying_coherence(
-            len(light), prism.diameter, modulation, structure, nonuniform
-        )
-        correlations = [TurbulentCorrelations(light, kernel, mean, variation) for _ in range(_WORKERS)]
-    task = _ResponseTask(kernel, light, _spans(light), first_samples, samples, interpolation, sums)
-    parts = np.array_split(np.arange(len(pixels_xy)), _WORKERS)
+        terms = _coherence_terms(len(light), prism.diameter, modulation, structure, nonuniform)
+        correlations = [TurbulentCorrelations(light, kernel, *terms) for _ in range(_WORKERS)]
+    sums = _ResponseSums(kernel, light, first_samples, samples, interpolation, local)
+    parts = np.array_split(np.arange(first_samples.shape[1]), _WORKERS)
     # Each worker multiplies matrices on its own thread.
     with limit_to_one_thread(), ThreadPoolExecutor(_WORKERS) as pool:
-        for future in [pool.submit(task.run, correlations[k], part, k) for k, part in enumerate(parts)]:
+        for future in [pool.submit(sums.add, correlations[k], part, k) for k, part in enumerate(parts)]:
             future.result()
-    return sums.normalise(local)
+    return sums.normalise()
 
 
-def _mean_and_varying_coherence(
+def _coherence_terms(
     n: int,
     diameter: float,
     modulation: ModulationPath,
     structure: NDArray[np.float64],
     nonuniform: NonuniformPhase | None,
-) -> tuple[NDArray[np.complex128], CoherenceVariation | None]:
+) -> tuple[NDArray[np.complex128], NDArray[np.float32] | None, NDArray[np.complex128] | None]:
     """Coherence of the least varying quarter of the pupil, and what is added where phases vary more.
 
     Between two samples the strength is the mean of both, and the coherence is taken as linear in it.
     """
     if nonuniform is None:
-        return coherence(n, diameter, modulation, structure), None
+        return coherence(n, diameter, modulation, structure), None, None
     low, high = np.percentile(nonuniform.strength, (25, 75))
     weak, strong = (
         coherence(n, diameter, modulation, structure + level * nonuniform.structure) for level in (low, high)
     )
-    half = (nonuniform.strength - low) / (2 * max(high - low, 1e-6))
-    return weak, CoherenceVariation(half.astype(np.float32), strong - weak)
+    half_share = (nonuniform.strength - low) / (2 * max(high - low, 1e-6))
+    return weak, half_share.astype(np.float32), strong - weak
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Sums:
-    """Differences of images and their derivatives, not yet normalised.
+class _ResponseSums:
+    """Differences of the images and their derivatives, summed by the workers of :func:`slope_response`."""
 
-    ``phase_derivatives (2, n_valid, m, m)`` for x and y; ``light (3, n_valid)`` is the x difference, the y
-    difference and the sum; ``total`` holds the derivative of each pixel's sum, or of all pixels' sum
-    in one part per worker.
-    """
+    def __init__(
+        self,
+        kernel: NDArray[np.complex64],
+        light: NDArray[np.float32],
+        first_samples: NDArray[np.intp],
+        samples: int,
+        interpolation: NDArray[np.float32] | None,
+        local: bool,
+    ) -> None:
+        self._kernel, self._light, self._first_samples = kernel, light, first_samples
+        self._samples, self._interpolation, self._local = samples, interpolation, local
+        # First lit column of each row and the one after the last.
+        self._spans = np.stack(lit_columns(np.asarray(light > 0)), axis=1)
+        m, n_valid = len(light) if interpolation is None else interpolation.shape[1], first_samples.shape[1]
+        self._derivatives = np.empty((2, n_valid, m, m), np.float32)
+        # Difference along x, along y, and sum of each pixel's four images.
+        self._power = np.zeros((3, n_valid))
+        # Derivative of each pixel's sum, or of all pixels' sum in one part per worker.
+        self._total = np.zeros((n_valid if local else _WORKERS, m, m), np.float32)
 
-    phase_derivatives: NDArray[np.float32]
-    light: NDArray[np.float64]
-    total: NDArray[np.float32]
-
-    def normalise(self, local: bool) -> SlopeResponse:
-        """Slopes and their derivatives; works in place."""
-        n = self.light.shape[1]
-        norm = self.light[2] if local else np.full(n, self.light[2].mean())
-        flat = self.light[:2] / norm
-        by_norm = self.total if local else self.total.sum(axis=0, keepdims=True) / np.float32(n)
-        for axis, phase_derivatives in enumerate(self.phase_derivatives):
-            for k, row in enumerate(phase_derivatives):
-                row -= np.float32(flat[axis, k]) * by_norm[k if local else 0]
-                row /= np.float32(norm[k])
-        return SlopeResponse(flat.ravel(), self.phase_derivatives.reshape(2 * n, -1))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _ResponseTask:
-    """Inputs and outputs shared by the workers of :func:`slope_response`."""
-
-    kernel: NDArray[np.complex64]
-    light: NDArray[np.float32]
-    spans: NDArray[np.intp]
-    first_samples: NDArray[np.intp]
-    samples: int
-    interpolation: NDArray[np.float32] | None
-    sums: _Sums
-
-    def run(self, pixel_correlations: PixelCorrelations, pixels: NDArray[np.intp], worker: int) -> None:
+    def add(
+        self,
+        pixel_correlations: ModulatedCorrelations | TurbulentCorrelations,
+        pixels: NDArray[np.intp],
+        worker: int,
+    ) -> None:
         """Compute the sums of ``pixels``."""
-        n, s, out = len(self.light), self.samples, self.sums
-        local = len(out.total) == out.light.shape[1]
+        n, s = len(self._light), self._samples
         inner = np.stack(np.divmod(np.arange(s * s), s), axis=1)
         sums = np.zeros((3, n, n), np.float32)
         for k in pixels:
-            sums[: 3 if local else 2] = 0
-            pixels_xy = (self.first_samples[:, k, None] + inner).reshape(-1, 2)
-            for i, correlations in enumerate(pixel_correlations.correlations(pixels_xy)):
-                row, column = pixels_xy[i] + (n - 1)
+            sums[: 3 if self._local else 2] = 0
+            at = (self._first_samples[:, k, None] + inner).reshape(-1, 2)
+            for i, correlations in enumerate(pixel_correlations.correlations(at)):
+                row, column = at[i] + (n - 1)
                 signs = _SIGNS[i // (s * s)]
-                light = _add_pixel_response(
-                    self.kernel, row, column, self.light, correlations, self.spans, signs, sums
+                power = _add_pixel_response(
+                    self._kernel, row, column, self._light, correlations, self._spans, signs, sums
                 )
-                out.light[:, k] += signs[0] * light, signs[1] * light, light
-            out.phase_derivatives[:, k] = self._to_nodes(sums[:2])
-            if local:
-                out.total[k] = self._to_nodes(sums[2])
-        if not local:
-            out.total[worker] = self._to_nodes(sums[2])
+                self._power[:, k] += signs[0] * power, signs[1] * power, power
+            self._derivatives[:, k] = self._to_nodes(sums[:2])
+            if self._local:
+                self._total[k] = self._to_nodes(sums[2])
+        if not self._local:
+            self._total[worker] = self._to_nodes(sums[2])
+
+    def normalise(self) -> SlopeResponse:
+        """Slopes and their derivatives; works in place."""
+        n = self._power.shape[1]
+        norm = self._power[2] if self._local else np.full(n, self._power[2].mean())
+        flat = self._power[:2] / norm
+        by_norm = self._total if self._local else self._total.sum(axis=0, keepdims=True) / np.float32(n)
+        for axis, derivatives in enumerate(self._derivatives):
+            for k, row in enumerate(derivatives):
+                row -= np.float32(flat[axis, k]) * by_norm[k if self._local else 0]
+                row /= np.float32(norm[k])
+        return SlopeResponse(flat.ravel(), self._derivatives.reshape(2 * n, -1))
 
     def _to_nodes(self, by_sample: NDArray[np.float32]) -> NDArray[np.float32]:
         """Convert derivatives by the phase at samples to those by the phase at nodes."""
-        if self.interpolation is None:
+        if self._interpolation is None:
             return by_sample
-        return np.asarray(self.interpolation.T @ (by_sample @ self.interpolation))
-
-
-def _spans(light: NDArray[np.float32]) -> NDArray[np.intp]:
-    """First lit column of each row and the one after the last ``(n, 2)``."""
-    return np.stack(lit_columns(np.asarray(light > 0)), axis=1)
+        return np.asarray(self._interpolation.T @ (by_sample @ self._interpolation))
 
 
 def _prism_kernel(prism: Prism, n: int, n_grid: int) -> NDArray[np.complex64]:

@@ -29,17 +29,11 @@ _SCREEN_PUPILS = 8
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PokePhase:
-    """Random pokes of many modes at once, new in every frame.
+    """Random pokes of many modes at once, new in every frame."""
 
-    Parameters
-    ----------
-    modes_rad
-        Phase ``(n_modes, n, n)`` in radians of each mode at its rms amplitude.
-    lit
-        Lit samples of the pupil ``(n, n)``.
-    """
-
+    #: Phase ``(n_modes, n, n)`` in radians of each mode at its rms amplitude.
     modes_rad: NDArray[np.float64]
+    #: Lit samples of the pupil ``(n, n)``.
     lit: NDArray[np.bool_]
 
     @classmethod
@@ -52,16 +46,8 @@ class PokePhase:
     ) -> PokePhase:
         """Pokes of a given rms over all modes, of equal amplitude except for modes at their maximum.
 
-        Parameters
-        ----------
-        rms
-            Root of the sum of the modes' squared amplitudes.
-        max_amplitude
-            Largest amplitude of every mode ``(n_modes,)``.
-        modes_rad
-            Phase ``(n_modes, n, n)`` of every mode at unit amplitude, in radians.
-        lit
-            Lit samples of the pupil ``(n, n)``.
+        ``rms`` is the root of the sum of the modes' squared amplitudes, ``max_amplitude (n_modes,)`` the
+        largest amplitude of every mode, ``modes_rad`` the modes at unit amplitude.
         """
         lower, upper = 0.0, float(max_amplitude.max())
         for _ in range(40):
@@ -71,11 +57,6 @@ class PokePhase:
         amplitude = np.minimum(upper, max_amplitude)
         amplitude *= rms / np.sqrt(np.square(amplitude).sum())
         return cls(amplitude[:, None, None] * modes_rad, lit)
-
-    @property
-    def rms_rad(self) -> float:
-        """Rms phase over the pupil in radians, without piston."""
-        return float(np.sqrt(self.modes_rad[:, self.lit].var(axis=1).sum()))
 
     def structure(self) -> NDArray[np.float64]:
         """Structure function in rad^2 ``(2 n - 1, 2 n - 1)``, by the separation of two samples.
@@ -127,21 +108,8 @@ def estimate_strength(
     variance rises where the rms hardly changes, and the rms falls where the fraction hardly rises; both
     together determine the strength. Without pokes the rising branch of the rms is used.
 
-    Parameters
-    ----------
-    optics
-        The nominal sensor.
-    pupils
-        Pupil images, with the measured motion.
-    outer_scale
-        Outer scale of the turbulence in pupil diameters.
-    pokes
-        Random pokes during the measurement; None without pokes.
-
-    Returns
-    -------
-    float
-        Between 0 (no motion, or none that persists) and the strongest trial.
+    ``optics`` is the nominal sensor, ``outer_scale`` in pupil diameters. The result is between 0 (no motion,
+    or none that persists) and the strongest trial.
     """
     if not pupils.motion:
         return 0.0
@@ -242,8 +210,8 @@ def turbulence_registration_scatter(
 
     Parameters
     ----------
-    optics, pupils
-        The nominal sensor and its pupil images.
+    optics
+        The nominal sensor.
     phases
         Random states ``(count, k, n, n)`` in radians: turbulence, with other pokes for every shape.
     shapes

@@ -18,8 +18,8 @@ from escape_hw.api.registration import Registration
 from escape_hw.api.sensor import SubApertureGrid
 from escape_hw.config.sensor import ShackHartmannSection
 from escape_hw.pipeline.slopes.shack_hartmann import subaperture_windows
-from escape_sim.mirror.influence_functions import InfluenceFunctions, nominal_influence_functions
-from escape_sim.mirror.mode_surfaces import N_DERIVATIVES, GaussianFactors, gaussian_factors, mode_surfaces
+from escape_sim.mirror.mode_surfaces import N_DERIVATIVES, GaussianFactors, mode_surfaces
+from escape_sim.models.base import DesignModel
 from escape_sim.optics.pupil import PupilGeometry, nominal_flux, pupil_geometry
 from escape_sim.optics.shack_hartmann import field_pixels, first_pixels, lenslet_transform
 
@@ -57,15 +57,6 @@ def slope_weights(
     relative to the pixels. It is also averaged over the turbulence within a lenslet
     (:func:`lenslet_turbulence`), which lifts the wings of the spots above the threshold; without it
     scalings would be underestimated.
-
-    Parameters
-    ----------
-    config
-        Design of sensor, camera and beam.
-    grid
-        The grid measured on the camera.
-    pupil
-        The sampled pupil.
 
     Returns
     -------
@@ -120,11 +111,6 @@ def lenslet_turbulence(samples: int) -> NDArray[np.float64]:
     return np.concatenate([first, first[::-1, ::-1, ::-1]])
 
 
-def _orientations(phase: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The eight orientations ``(8, p, p)`` of a square wavefront ``(p, p)``."""
-    return np.stack([np.rot90(p, turns) for p in (phase, phase.T) for turns in range(_N_ORIENTATIONS // 2)])
-
-
 def _turbulence_strength(config: SystemConfig, grid: SubApertureGrid) -> float:
     """``(d / r0)^(5/3)`` of the turbulence on a lenslet, from the spot motion that it causes."""
     sensor = config.sensor_as(ShackHartmannSection)
@@ -175,13 +161,10 @@ class _WindowImages:
             exists = (i >= 0) & (i < n) & (j >= 0) & (j < n)
             i, j = np.clip(i, 0, n - 1), np.clip(j, 0, n - 1)
             self._blocks[step] = (blocks[i, j] * exists[:, None, None]).astype(self._real)
-            self._along[step] = tuple(
-                self._transform(first + (np.arange(n) + by) * pitch, at, p, field)[number]
-                for first, pitch, by, at, number in (
-                    (y_first, y_pitch, step[0], row_at, rows),
-                    (x_first, x_pitch, step[1], column_at, columns),
-                )
-            )
+            y, x = y_first + (np.arange(n) + step[0]) * y_pitch, x_first + (np.arange(n) + step[1]) * x_pitch
+            self._along[step] = (
+                self._transform(y, row_at, p, field)[rows], self._transform(x, column_at, p, field)[columns],
+            )  # fmt: skip
 
     def _transform(
         self, centre: NDArray[np.floating], at: NDArray[np.intp], p: int, field: int
@@ -205,7 +188,8 @@ class _WindowImages:
         Every window rotates the shift, and orients the blurring ``phase``, in its own way.
         """
         (cosine, sine), (along, across) = self._axes, shift
-        blur = np.exp(1j * _orientations(phase)).astype(self._complex)[self._orientation]
+        oriented = np.stack([np.rot90(p, turns) for p in (phase, phase.T) for turns in range(4)])
+        blur = np.exp(1j * oriented).astype(self._complex)[self._orientation]
         tilt = [
             np.exp(2j * np.pi * d[:, None] * self._samples / self._spot).astype(self._complex).conj()
             for d in (sine * along + cosine * across, cosine * along - sine * across)
@@ -257,14 +241,7 @@ class SlopeOperator:
     A window receives light of its own lenslet and the eight around it, so each slope is a weighted sum
     over ``3 x 3`` lenslets of ``NODES x NODES`` nodes.
 
-    Parameters
-    ----------
-    weights
-        From :func:`slope_weights`: slopes per unit of surface on each pupil sample.
-    valid
-        Lenslets with a window ``(n_sub, n_sub)``.
-    sub_aperture_m
-        Size of a sub-aperture in metres.
+    ``weights`` are those of :func:`slope_weights`, ``valid (n_sub, n_sub)`` the lenslets with a window.
     """
 
     def __init__(
@@ -280,20 +257,14 @@ class SlopeOperator:
         k = nodes.size
         table = np.zeros((rows.size, 2, _LENSLETS_ACROSS, k, _LENSLETS_ACROSS, k))
         for (down, right), block in weights.items():
-            table[:, :, down + 1, :, right + 1, :] = (interpolation.T @ block @ interpolation).transpose(
-                1, 0, 2, 3
-            )
+            at_nodes = interpolation.T @ block @ interpolation
+            table[:, :, down + 1, :, right + 1, :] = at_nodes.transpose(1, 0, 2, 3)
         self._table = table.reshape(rows.size, 2, _LENSLETS_ACROSS * k, _LENSLETS_ACROSS * k)
         # Lenslets beyond the edge have nodes with zero weights.
         lattice = np.arange(-1, n_sub + 1) - (n_sub - 1) / 2
         self.nodes_m = ((lattice[:, None] + nodes) * sub_aperture_m).ravel()
         self._first_y, self._first_x = (rows * k).astype(np.int64), (columns * k).astype(np.int64)
         self._tables_by_dtype: dict[str, NDArray[np.floating]] = {}
-
-    @property
-    def n_slopes(self) -> int:
-        """Number of slopes, all x and then all y."""
-        return 2 * len(self._table)
 
     def slopes(self, surfaces: NDArray[np.floating]) -> NDArray[np.floating]:
         """Slopes ``(n_slopes, n)`` of surfaces ``(n_nodes, n_nodes, n)`` at the nodes.
@@ -302,7 +273,7 @@ class SlopeOperator:
         """
         out = np.zeros((2, len(self._table), surfaces.shape[2]), surfaces.dtype)
         _apply_to_surfaces(self._weights(surfaces.dtype), self._first_y, self._first_x, surfaces, out)
-        return out.reshape(self.n_slopes, -1)
+        return out.reshape(2 * len(self._table), -1)
 
     def zonal(self, factors: GaussianFactors, *, derivatives: bool = False) -> NDArray[np.floating]:
         """Slopes of all influence functions ``(n, n_slopes, n_act)``, from their separable factors.
@@ -315,7 +286,7 @@ class SlopeOperator:
         side = np.ascontiguousarray(x[:kinds].transpose(1, 0, 2)).reshape(x.shape[1], -1)
         out = np.zeros((5 if derivatives else 1, 2, len(self._table), x.shape[2]), x.dtype)
         _apply_to_factors(self._weights(x.dtype), self._first_y, self._first_x, side, y, out)
-        return out.reshape(len(out), self.n_slopes, -1)
+        return out.reshape(len(out), 2 * len(self._table), -1)
 
     def _weights(self, dtype: DTypeLike) -> NDArray[np.floating]:
         kind = np.dtype(dtype).str
@@ -391,18 +362,12 @@ def nominal_grid(config: SystemConfig) -> SubApertureGrid:
     return SubApertureGrid(pitch, origin, valid, references, flux.astype(np.float32), 0.0)
 
 
-class ShackHartmannModel:
+class ShackHartmannModel(DesignModel):
     """Small-signal slopes of a diffractive Shack-Hartmann sensor with a mirror of Gaussian actuators.
 
     The centre of gravity of a spot is a smooth function of the phase on its lenslet. Its derivative is
     a fixed weight map per lenslet, so a matrix needs one small product per sub-aperture and no frames.
-
-    Parameters
-    ----------
-    config
-        The design: sensor, mirror and beam. Its ``twin`` section is not read.
-    grid
-        The grid measured on the camera.
+    ``grid`` is the one measured on the camera.
 
     Raises
     ------
@@ -413,33 +378,17 @@ class ShackHartmannModel:
     name = "fast"
 
     def __init__(self, config: SystemConfig, grid: SubApertureGrid) -> None:
-        self._pupil = pupil_geometry(config)
+        super().__init__(config, pupil_geometry(config))
         if grid.valid.shape != (self._pupil.n_sub, self._pupil.n_sub):
             raise ValueError(
                 f"the grid has {grid.valid.shape} lenslets, "
                 f"the design {self._pupil.n_sub} x {self._pupil.n_sub}"
             )
-        self._nominal = nominal_influence_functions(config)
         self._opd_per_command_m = 2 * config.devices.dm.stroke_m
-        self._config, self._grid = config, grid
+        self._grid = grid
         self._variants: list[ShackHartmannModel] | None = None
         weights = slope_weights(config, grid, self._pupil)
         self._slopes = SlopeOperator(weights, grid.valid, self._pupil.sub_aperture_m)
-
-    @property
-    def n_act(self) -> int:
-        """Number of actuators."""
-        return self._nominal.n_act
-
-    @property
-    def actuator_positions_m(self) -> NDArray[np.float64]:
-        """Nominal positions of the actuators ``(n_act, 2)`` as (x, y) on the pupil in metres."""
-        return self._nominal.positions_m
-
-    @property
-    def sub_aperture_m(self) -> float:
-        """Size of a sub-aperture on the pupil in metres."""
-        return self._pupil.sub_aperture_m
 
     def influence_functions(self) -> tuple[NDArray[np.float64], NDArray[np.bool_], float]:
         """Nominal influence functions for the modal basis, see :class:`SyntheticModel`."""
@@ -449,28 +398,24 @@ class ShackHartmannModel:
             self._pupil.coordinates_m.reshape(-1, 2).mean(axis=1), self._pupil.amplitude[::2, ::2],
         )  # fmt: skip
         x = pupil.coordinates_m
-        surfaces = self._influence(1.0).surfaces(Registration(), self.sub_aperture_m, x, x)
         r2 = x[:, None] ** 2 + x[None, :] ** 2
         radius = self._pupil.n_sub * self._pupil.sub_aperture_m / 2
-        return surfaces, r2 <= radius**2, pupil.pixel_m
+        return self._surfaces(x), r2 <= radius**2, pupil.pixel_m
 
     def zonal_matrix(self, registration: Registration, width: float = 1.0) -> NDArray[np.float64]:
         """Slopes in pixels per unit command ``(n_slopes, n_act)``, see :class:`SyntheticModel`."""
         if registration.anamorphosis_angle:
             # An inclined elliptic Gaussian is not separable in x and y.
-            at = self._slopes.nodes_m
-            surfaces = self._influence(width).surfaces(registration, self.sub_aperture_m, at, at)
-            return np.asarray(
-                self._slopes.slopes(np.moveaxis(surfaces, 0, 2).copy()) * self._opd_per_command_m
-            )
-        factors = self._factors(registration, width, np.float64)
+            surfaces = np.moveaxis(self._surfaces(self._slopes.nodes_m, registration, width), 0, 2).copy()
+            return np.asarray(self._slopes.slopes(surfaces) * self._opd_per_command_m)
+        factors = self._factors(self._slopes.nodes_m, registration, width, np.float64)
         return np.asarray(self._slopes.zonal(factors)[0] * self._opd_per_command_m)
 
     def zonal_jacobian(
         self, registration: Registration, width: float = 1.0
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Zonal matrix and its derivatives, see :class:`DifferentiableModel`; single precision."""
-        factors = self._factors(registration, width, np.float32)
+        factors = self._factors(self._slopes.nodes_m, registration, width)
         parts = self._slopes.zonal(factors, derivatives=True) * np.float32(self._opd_per_command_m)
         out = np.empty((N_DERIVATIVES, *parts.shape[1:]))
         for p, ((along_x, along_y), (width_x, width_y)) in enumerate(
@@ -487,7 +432,7 @@ class ShackHartmannModel:
         self, registration: Registration, m2c: NDArray[np.float64], width: float = 1.0
     ) -> NDArray[np.float64]:
         """Slopes per unit mode ``(n_slopes, n_modes)``, see :class:`DifferentiableModel`."""
-        factors = self._factors(registration, width, np.float32)
+        factors = self._factors(self._slopes.nodes_m, registration, width)
         if m2c.shape[1] <= _MAX_DIRECT_MODES:
             return np.asarray(
                 self._slopes.slopes(mode_surfaces(factors, m2c)) * self._opd_per_command_m, dtype=float
@@ -498,7 +443,7 @@ class ShackHartmannModel:
         self, registration: Registration, m2c: NDArray[np.float64], width: float = 1.0
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Modal matrix and its derivatives, see :class:`DifferentiableModel`; single precision."""
-        factors = self._factors(registration, width, np.float32)
+        factors = self._factors(self._slopes.nodes_m, registration, width)
         parts = self._slopes.zonal(factors, derivatives=True)
         modes = (m2c * self._opd_per_command_m).astype(np.float32)
         out = np.zeros((N_DERIVATIVES, parts.shape[1], m2c.shape[1]))
@@ -518,10 +463,3 @@ class ShackHartmannModel:
             grid = replace(self._grid, motion_px=self._grid.motion_px * (1 + _MOTION_UNCERTAINTY))
             self._variants = [ShackHartmannModel(self._config, grid)] if grid.motion_px else []
         return list(self._variants)
-
-    def _factors(self, registration: Registration, width: float, dtype: DTypeLike) -> GaussianFactors:
-        at = self._slopes.nodes_m
-        return gaussian_factors(self._influence(width), registration, self.sub_aperture_m, at, at, dtype)
-
-    def _influence(self, width: float) -> InfluenceFunctions:
-        return replace(self._nominal, width=width)

@@ -89,14 +89,20 @@ def mis_registration(registration: Registration, sub_aperture_m: float) -> Any:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SourceAndTelescope:
-    """A monochromatic source and a telescope.
-
-    ``photons_per_unit`` is the number of photons for one unit of ``amplitude ** 2``.
-    """
+    """A monochromatic source and a telescope."""
 
     source: Any
     telescope: Any
+    #: Number of photons for one unit of ``amplitude ** 2``.
     photons_per_unit: float
+
+    def propagate(self, path: Any, sensor: Any) -> None:
+        """Propagate the light to a sensor by OOPAO's mirror or an optical path ``(n, n)`` in metres."""
+        with suppress_output():
+            if isinstance(path, np.ndarray):
+                path = oopao_classes().OPD_map(path.astype(float))
+            # '**' starts a new propagation; '*' would add to the last one.
+            self.source**self.telescope * path * sensor
 
 
 def make_source(amplitude: NDArray[np.float32], diameter_m: float, wavelength_m: float) -> SourceAndTelescope:
@@ -114,10 +120,8 @@ def make_source(amplitude: NDArray[np.float32], diameter_m: float, wavelength_m:
         source = lib.Source("R", 0, display_properties=False)
         source.wavelength = wavelength_m  # OOPAO's constructor takes named bands only
         source * telescope
-        photons_per_unit = (
-            float(source.nPhoton) * telescope.samplingTime * (diameter_m / amplitude.shape[0]) ** 2
-        )
-    return SourceAndTelescope(source, telescope, photons_per_unit)
+        photons = float(source.nPhoton) * telescope.samplingTime * (diameter_m / amplitude.shape[0]) ** 2
+    return SourceAndTelescope(source, telescope, photons)
 
 
 def make_lenslets(light: SourceAndTelescope, n_sub: int, window: int) -> Any:

@@ -15,7 +15,7 @@ from escape_hw.api.synthetic_model import SyntheticModel
 from escape_hw.config.sensor import ShackHartmannSection
 from escape_hw.errors import CalibrationError
 from escape_hw.pipeline.slopes.pyramid import slopes_of_image
-from escape_sim.mirror.influence_functions import nominal_influence_functions
+from escape_sim.models.base import DesignModel
 from escape_sim.models.factory import model_geometry
 from escape_sim.oopao.library import (
     SourceAndTelescope,
@@ -37,96 +37,67 @@ if TYPE_CHECKING:
 POKE_SURFACE_M = 0.5e-9
 
 
-class OOPAOMirror:
-    """OOPAO's ``DeformableMirror`` for the design's mirror on a pupil."""
-
-    def __init__(self, config: SystemConfig, pupil: PupilGeometry, light: SourceAndTelescope) -> None:
-        n = pupil.n_sub * pupil.n_pix
-        self._pupil, self._telescope, self._stroke_m = pupil, light.telescope, config.devices.dm.stroke_m
-        # OOPAO's mirror has its n samples from edge to edge, its wavefront at pixel centres: lengths for
-        # the mirror must be larger by this factor.
-        self._edge_factor = n / (n - 1)
-        self._influence = nominal_influence_functions(config)
-        self._mirrors: dict[float, Any] = {}
-
-    @property
-    def n_act(self) -> int:
-        """Number of actuators."""
-        return self._influence.n_act
-
-    @property
-    def unit_command_factor(self) -> float:
-        """Full strokes in the difference of a push and a pull of :data:`POKE_SURFACE_M`."""
-        return self._stroke_m / (2 * POKE_SURFACE_M)
-
-    def influence_functions(self) -> tuple[NDArray[np.float64], NDArray[np.bool_], float]:
-        """Nominal influence functions, see :class:`SyntheticModel`."""
-        modes = np.asarray(self._nominal(1.0).modes, dtype=float)
-        lit = self._pupil.lit
-        return modes.T.reshape(self.n_act, *lit.shape), lit, self._pupil.pixel_m
-
-    def apply_registration(self, registration: Registration, width: float) -> Any:
-        """OOPAO's mirror under a registration, its influence functions ``width`` times as wide."""
-        shift = mis_registration(registration, self._pupil.sub_aperture_m * self._edge_factor)
-        with suppress_output():
-            return self._nominal(width).apply_mis_registration(shift)
-
-    def _nominal(self, width: float) -> Any:
-        """OOPAO's mirror without misregistration; cached for four widths."""
-        if width not in self._mirrors:
-            if len(self._mirrors) >= 4:
-                self._mirrors.clear()
-            with suppress_output():
-                self._mirrors[width] = oopao_classes().DeformableMirror(
-                    telescope=self._telescope,
-                    nSubap=self._pupil.n_sub,
-                    mechCoupling=self._influence.coupling,
-                    coordinates=self._influence.positions_m * self._edge_factor,
-                    pitch=self._influence.pitch_m * self._edge_factor * width,
-                    print_dm_properties=False,
-                )
-        return self._mirrors[width]
-
-
 #: Actuators propagated together; limits the memory.
 _BATCH = 16
+#: Widths whose mirrors are kept.
+_MAX_CACHED_MIRRORS = 4
 
 
-class OOPAOPushPullModel(abc.ABC):
-    """Small-signal slopes as push minus pull of OOPAO's mirror."""
+class OOPAOPushPullModel(DesignModel, abc.ABC):
+    """Small-signal slopes as push minus pull of OOPAO's ``DeformableMirror``."""
 
     name = "oopao"
 
     def __init__(self, config: SystemConfig, pupil: PupilGeometry, light: SourceAndTelescope) -> None:
-        self._pupil = pupil
-        self._mirror = OOPAOMirror(config, pupil, light)
-
-    @property
-    def n_act(self) -> int:
-        """Number of actuators."""
-        return self._mirror.n_act
-
-    @property
-    def sub_aperture_m(self) -> float:
-        """Size of a sub-aperture, or of a pixel of the pupil image, on the pupil in metres."""
-        return self._pupil.sub_aperture_m
+        super().__init__(config, pupil)
+        self._light = light
+        n = pupil.n_sub * pupil.n_pix
+        # OOPAO's mirror has its n samples from edge to edge, its wavefront at pixel centres: lengths for
+        # the mirror must be larger by this factor.
+        self._edge_factor = n / (n - 1)
+        self._mirrors: dict[float, Any] = {}
 
     def influence_functions(self) -> tuple[NDArray[np.float64], NDArray[np.bool_], float]:
         """Nominal influence functions, see :class:`SyntheticModel`."""
-        return self._mirror.influence_functions()
+        modes = np.asarray(self._nominal_mirror(1.0).modes, dtype=float)
+        lit = self._pupil.lit
+        return modes.T.reshape(self.n_act, *lit.shape), lit, self._pupil.pixel_m
 
     def zonal_matrix(self, registration: Registration, width: float = 1.0) -> NDArray[np.float64]:
         """Slopes per unit command ``(n_slopes, n_act)``, see :class:`SyntheticModel`."""
-        mirror = self._mirror.apply_registration(registration, width)
+        mirror = self.registered_mirror(registration, width)
         # The optical path changes by twice the surface.
         pokes = np.eye(self.n_act) * 2 * POKE_SURFACE_M
         batches = [pokes[:, start : start + _BATCH] for start in range(0, self.n_act, _BATCH)]
         differences = [self._slopes(mirror, batch) - self._slopes(mirror, -batch) for batch in batches]
-        return np.asarray(np.concatenate(differences, axis=1) * self._mirror.unit_command_factor)
+        strokes = self._config.devices.dm.stroke_m / (2 * POKE_SURFACE_M)
+        return np.asarray(np.concatenate(differences, axis=1) * strokes)
 
     def variants(self) -> list[Self]:
         """No variants: there is no turbulence or spot motion to be uncertain about."""
         return []
+
+    def registered_mirror(self, registration: Registration, width: float) -> Any:
+        """OOPAO's mirror under a registration, its influence functions ``width`` times as wide."""
+        shift = mis_registration(registration, self.sub_aperture_m * self._edge_factor)
+        with suppress_output():
+            return self._nominal_mirror(width).apply_mis_registration(shift)
+
+    def _nominal_mirror(self, width: float) -> Any:
+        """OOPAO's mirror without misregistration."""
+        if width not in self._mirrors:
+            if len(self._mirrors) >= _MAX_CACHED_MIRRORS:
+                self._mirrors.clear()
+            with suppress_output():
+                self._mirrors[width] = oopao_classes().DeformableMirror(
+                    telescope=self._light.telescope,
+                    nSubap=self._pupil.n_sub,
+                    mechCoupling=self._nominal.coupling,
+                    coordinates=self._nominal.positions_m * self._edge_factor,
+                    pitch=self._nominal.pitch_m * self._edge_factor * width,
+                    print_dm_properties=False,
+                )
+        return self._mirrors[width]
 
     @abc.abstractmethod
     def _slopes(self, mirror: Any, paths_m: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -138,12 +109,7 @@ class OOPAOPyramidModel(OOPAOPushPullModel):
 
     OOPAO's own slopes are not used, since they assume that the four images are on a perfect square.
 
-    Parameters
-    ----------
-    config
-        The design: sensor, mirror and beam. Its ``twin`` section is not read.
-    pupils
-        The pupil images measured on the camera.
+    ``pupils`` are the pupil images measured on the camera.
 
     Raises
     ------
@@ -176,7 +142,62 @@ class OOPAOPyramidModel(OOPAOPushPullModel):
         return out
 
 
-def make_model(config: SystemConfig, grid: SensorGeometry | None) -> SyntheticModel:
+class OOPAOShackHartmannModel(OOPAOPushPullModel):
+    """Small-signal slopes of a Shack-Hartmann sensor with mirror, registration and diffraction by OOPAO 1.0.
+
+    Slopes are centres of gravity without threshold over the camera's windows, including light of the
+    neighbouring lenslets. Not used are OOPAO's centroid, whose relative threshold makes matrices depend
+    on the stroke; its ``SPRINT``, whose rounding loses shifts at the scale of a bench; and its modal
+    bases, whose signs change between runs. ``grid`` is the grid measured on the camera.
+
+    Raises
+    ------
+    ConfigError
+        OOPAO is not installed.
+    CalibrationError
+        The grid does not fit the design.
+    """
+
+    def __init__(self, config: SystemConfig, grid: SubApertureGrid) -> None:
+        pupil = pupil_geometry(config)
+        n_sub = pupil.n_sub
+        if grid.valid.shape != (n_sub, n_sub):
+            raise CalibrationError(f"the grid has {grid.valid.shape} lenslets; sensor.n_sub is {n_sub}")
+        light = make_source(pupil.amplitude, pupil.sub_aperture_m * n_sub, config.system.wavelength_m)
+        super().__init__(config, pupil, light)
+        self._lenslets = make_lenslets(self._light, n_sub, SAMPLING * pupil.n_pix)
+        lit = self._lenslets.sh_data["src_0"].valid_subapertures
+        if (grid.valid & ~lit).any():
+            raise CalibrationError(
+                f"{int((grid.valid & ~lit).sum())} valid sub-apertures of the grid lie outside the design's "
+                "pupil; check the grid and sensor.n_sub"
+            )
+        spot_px = config.sensor_as(ShackHartmannSection).spot_px
+        self._moments = window_moments(
+            grid, np.asarray(lit), config.devices.wfs.region[:1:-1], pupil.n_pix, spot_px
+        )
+
+    def _slopes(self, mirror: Any, paths_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Spot positions ``(n_slopes, n)`` in camera pixels for mirror shapes ``(n_act, n)``."""
+        n = paths_m.shape[1]
+        # OOPAO drops the last axis of a single wavefront, so it is propagated twice.
+        if n == 1:
+            paths_m = np.repeat(paths_m, 2, axis=1)
+        with suppress_output():
+            mirror.coefs = paths_m
+        self._light.propagate(mirror, self._lenslets)
+        spots = np.asarray(self._lenslets.maps_intensity)[:n]
+        total, along_x, along_y = np.zeros((3, n, len(self._moments[0].lenslet)))
+        for part in self._moments:
+            # OOPAO's image of a lenslet has x along its rows.
+            over_y = np.einsum("bkxy,kyl->bkxl", spots[:, part.lenslet], part.along_y, optimize=True)
+            total += np.einsum("bkx,kx->bk", over_y[..., 0], part.along_x[..., 0])
+            along_x += np.einsum("bkx,kx->bk", over_y[..., 0], part.along_x[..., 1])
+            along_y += np.einsum("bkx,kx->bk", over_y[..., 1], part.along_x[..., 0])
+        return np.concatenate([along_x / total, along_y / total], axis=1).T
+
+
+def make_oopao_model(config: SystemConfig, grid: SensorGeometry | None) -> SyntheticModel:
     """Entry point ``oopao``; without a grid, on the design's nominal one.
 
     Raises
@@ -192,68 +213,5 @@ def make_model(config: SystemConfig, grid: SensorGeometry | None) -> SyntheticMo
     return OOPAOShackHartmannModel(config, geometry)
 
 
-class OOPAOShackHartmannModel(OOPAOPushPullModel):
-    """Small-signal slopes of a Shack-Hartmann sensor with mirror, registration and diffraction by OOPAO 1.0.
-
-    Slopes are centres of gravity without threshold over the camera's windows, including light of the
-    neighbouring lenslets. Not used are OOPAO's centroid, whose relative threshold makes matrices depend
-    on the stroke; its ``SPRINT``, whose rounding loses shifts at the scale of a bench; and its modal
-    bases, whose signs change between runs.
-
-    Parameters
-    ----------
-    config
-        The design: sensor, mirror and beam. Its ``twin`` section is not read.
-    grid
-        The grid measured on the camera.
-
-    Raises
-    ------
-    ConfigError
-        OOPAO is not installed.
-    CalibrationError
-        The grid does not fit the design.
-    """
-
-    def __init__(self, config: SystemConfig, grid: SubApertureGrid) -> None:
-        pupil = pupil_geometry(config)
-        n_sub = pupil.n_sub
-        if grid.valid.shape != (n_sub, n_sub):
-            raise CalibrationError(f"the grid has {grid.valid.shape} lenslets; sensor.n_sub is {n_sub}")
-        self._light = make_source(pupil.amplitude, pupil.sub_aperture_m * n_sub, config.system.wavelength_m)
-        super().__init__(config, pupil, self._light)
-        self._lenslets = make_lenslets(self._light, n_sub, SAMPLING * pupil.n_pix)
-        lit = self._lenslets.sh_data["src_0"].valid_subapertures
-        if (grid.valid & ~lit).any():
-            raise CalibrationError(
-                f"{int((grid.valid & ~lit).sum())} valid sub-apertures of the grid lie outside the design's "
-                "pupil; check the grid and sensor.n_sub"
-            )
-        self._moments = window_moments(
-            grid,
-            np.asarray(lit),
-            config.devices.wfs.region[:1:-1],
-            pupil.n_pix,
-            config.sensor_as(ShackHartmannSection).spot_px,
-        )
-
-    def _slopes(self, mirror: Any, paths_m: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Spot positions ``(n_slopes, n)`` in camera pixels for mirror shapes ``(n_act, n)``."""
-        n = paths_m.shape[1]
-        # OOPAO drops the last axis of a single wavefront, so it is propagated twice.
-        if n == 1:
-            paths_m = np.repeat(paths_m, 2, axis=1)
-        light = self._light
-        with suppress_output():
-            mirror.coefs = paths_m
-            # '**' starts a new propagation; '*' would add to the last one.
-            light.source**light.telescope * mirror * self._lenslets
-            spots = np.asarray(self._lenslets.maps_intensity)[:n]
-        total, along_x, along_y = np.zeros((3, n, len(self._moments[0].lenslet)))
-        for part in self._moments:
-            # OOPAO's image of a lenslet has x along its rows.
-            over_y = np.einsum("bkxy,kyl->bkxl", spots[:, part.lenslet], part.along_y, optimize=True)
-            total += np.einsum("bkx,kx->bk", over_y[..., 0], part.along_x[..., 0])
-            along_x += np.einsum("bkx,kx->bk", over_y[..., 0], part.along_x[..., 1])
-            along_y += np.einsum("bkx,kx->bk", over_y[..., 1], part.along_x[..., 0])
-        return np.concatenate([along_x / total, along_y / total], axis=1).T
+#: Name of the entry point in the metadata of editable installations made before it was renamed.
+make_model = make_oopao_model

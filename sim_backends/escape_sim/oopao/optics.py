@@ -9,11 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from escape_hw.pipeline.slopes.shack_hartmann import subaperture_windows
-from escape_sim.oopao.library import make_lenslets, make_pyramid, make_source, oopao_classes, suppress_output
+from escape_sim.oopao.library import make_lenslets, make_pyramid, make_source, suppress_output
+from escape_sim.optics.base import ModulatedOptics
 from escape_sim.optics.fourier_filter import next_fast_length
 from escape_sim.optics.modulation import ModulationPath
 from escape_sim.optics.pyramid import GridRegion, Prism
-from escape_sim.optics.shack_hartmann import field_pixels, first_pixels
+from escape_sim.optics.shack_hartmann import LensletOptics, field_pixels, first_pixels
 
 if TYPE_CHECKING:
     from escape_hw.api.sensor import SubApertureGrid
@@ -38,19 +39,8 @@ def trigonometric_interpolation(at: NDArray[np.float64], period: int) -> NDArray
 def camera_pixel_matrix(offset_px: NDArray[np.float64], n_pix: int, spot_px: float) -> NDArray[np.float64]:
     """Matrix from OOPAO's samples of a lenslet's image to camera pixels, along one axis.
 
-    Parameters
-    ----------
-    offset_px
-        Pixels relative to the lenslet's centre, any shape.
-    n_pix
-        Pupil samples across a lenslet.
-    spot_px
-        lambda/d in camera pixels.
-
-    Returns
-    -------
-    ndarray, ``(*offset_px.shape, SAMPLING * n_pix)``
-        Normalised so that a whole field contains the light of the lenslet.
+    ``offset_px`` are pixels relative to the lenslet's centre. The matrix ``(*offset_px.shape, SAMPLING *
+    n_pix)`` is normalised so that a whole field contains the light of the lenslet.
     """
     period = SAMPLING * n_pix
     at = (period - 1) / 2 + offset_px * SAMPLING / spot_px
@@ -59,18 +49,12 @@ def camera_pixel_matrix(offset_px: NDArray[np.float64], n_pix: int, spot_px: flo
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WindowMoments:
-    """Weights of OOPAO's samples of one lenslet in each window's sums.
+    """Weights of OOPAO's samples of one lenslet in each window's sums."""
 
-    Parameters
-    ----------
-    lenslet
-        Index of the lenslet among the lit ones ``(n_valid,)``; arbitrary where the weights are 0.
-    along_x, along_y
-        Weights for the window's sum and its first moment about its own lenslet's centre,
-        ``(n_valid, samples, 2)``.
-    """
-
+    #: Index of the lenslet among the lit ones ``(n_valid,)``; arbitrary where the weights are 0.
     lenslet: NDArray[np.intp]
+    #: Weights ``(n_valid, samples, 2)`` for the window's sum and its first moment about its own lenslet's
+    #: centre, along either axis.
     along_x: NDArray[np.float64]
     along_y: NDArray[np.float64]
 
@@ -80,16 +64,8 @@ def window_moments(
 ) -> list[WindowMoments]:
     """Weights of every valid window for its own lenslet and the eight around it.
 
-    Parameters
-    ----------
-    grid
-        The sub-aperture grid.
-    lit
-        Lit lenslets ``(n_sub, n_sub)``, in whose order OOPAO returns images.
-    shape
-        Camera region (rows, columns).
-    n_pix, spot_px
-        Pupil samples across a lenslet, and lambda/d in camera pixels.
+    ``lit (n_sub, n_sub)`` are the lit lenslets, in whose order OOPAO returns images; other parameters as for
+    :class:`LensletOptics`.
     """
     n_sub = lit.shape[0]
     number = np.where(lit, np.cumsum(lit).reshape(lit.shape) - 1, -1)
@@ -127,13 +103,12 @@ def window_moments(
     return out
 
 
-class OOPAOShackHartmann:
-    """OOPAO's propagation with the interface of ``ShackHartmannOptics``.
+class OOPAOShackHartmann(LensletOptics):
+    """Shack-Hartmann optics by OOPAO's propagation; parameters of :class:`LensletOptics`.
 
     OOPAO's detector has a whole number of pixels per lenslet and of pixels per lambda/d, unlike the
     bench's camera. OOPAO therefore computes each lenslet at two pixels per lambda/d over its full field,
-    which exact trigonometric interpolation resamples to the camera's pixels. Parameters as for
-    ``ShackHartmannOptics``; ``n_pix`` must be even.
+    which exact trigonometric interpolation resamples to the camera's pixels.
 
     Raises
     ------
@@ -143,92 +118,43 @@ class OOPAOShackHartmann:
         The amplitude has another shape, ``n_pix`` is odd, or a lit lenslet is outside the region.
     """
 
-    def __init__(
-        self,
-        n_sub: int,
-        n_pix: int,
-        wavelength_m: float,
-        pitch_px: float,
-        spot_px: float,
-        origin_px: tuple[float, float],
-        shape: tuple[int, int],
-        amplitude: NDArray[np.float32],
-    ) -> None:
-        n = n_sub * n_pix
-        if amplitude.shape != (n, n):
+    def _prepare(self, wavelength_m: float, spot_px: float) -> None:
+        if self._n_pix % 2:
             raise ValueError(
-                f"amplitude has shape {amplitude.shape}; {n_sub} x {n_pix} samples need ({n}, {n})"
+                f"{self._n_pix} samples per lenslet; OOPAO centres its spots on even numbers only"
             )
-        if n_pix % 2:
-            raise ValueError(f"{n_pix} samples per lenslet; OOPAO centres its spots on even numbers only")
-        self.shape = shape
-        self.amplitude = np.ascontiguousarray(amplitude, dtype=np.float32)
         # Only angles matter, so the size of the pupil is arbitrary: one metre per lenslet.
-        self._light = make_source(self.amplitude, float(n_sub), wavelength_m)
-        self._sensor = make_lenslets(self._light, n_sub, SAMPLING * n_pix)
-        self._data = self._sensor.sh_data["src_0"]
-        self._lit = np.argwhere(self._data.valid_subapertures)
+        self._light = make_source(self.amplitude, float(self._n_sub), wavelength_m)
+        self._sensor = make_lenslets(self._light, self._n_sub, SAMPLING * self._n_pix)
+        self._lit_lenslets = np.argwhere(self._sensor.sh_data["src_0"].valid_subapertures)
+        self._to_x, self._to_y = (
+            camera_pixel_matrix(
+                first[:, None] + np.arange(self._size) - centres[:, None], self._n_pix, spot_px
+            )
+            for centres, first in ((self._x, self._x0), (self._y, self._y0))
+        )
 
-        field = field_pixels(n_pix, spot_px)
-        self._field = field
-        line = np.arange(n_sub) * pitch_px
-        self._first: list[NDArray[np.intp]] = []
-        self._to_pixels: list[NDArray[np.float64]] = []
-        for start, length, numbers in zip(origin_px, shape[::-1], self._lit.T[::-1], strict=True):
-            centres = np.asarray(start + line, dtype=np.float64)
-            first = first_pixels(centres, field)
-            pixels = first[:, None] + np.arange(field) - centres[:, None]
-            self._first.append(first)
-            self._to_pixels.append(camera_pixel_matrix(pixels, n_pix, spot_px))
-            used = first[numbers]
-            if used.min() < 0 or used.max() + field > length:
-                raise ValueError(
-                    f"lit lenslets fall outside the region of {shape[1]} x {shape[0]} pixels; "
-                    "enlarge the camera region or move the grid's origin"
-                )
-
-    def frame(
-        self, opd_m: NDArray[np.float32], image: NDArray[np.float32] | None = None
-    ) -> NDArray[np.float32]:
-        """Add the intensity ``(rows, columns)`` to ``image``, a new array by default, and return it.
-
-        ``opd_m (n, n)`` is the optical path difference in metres. The intensity sums to the sum of
-        ``amplitude ** 2``, except for light outside the field of a lenslet.
-        """
-        if opd_m.shape != self.amplitude.shape:
-            raise ValueError(f"the optical path has shape {opd_m.shape}, the pupil {self.amplitude.shape}")
-        out = np.zeros(self.shape, np.float32) if image is None else image
-        spots = self._spots(opd_m)
-        x0, y0 = self._first
-        to_x, to_y = self._to_pixels
-        size = self._field
-        for (i, j), spot in zip(self._lit, spots, strict=True):
+    def _add_intensity(self, opd_m: NDArray[np.floating], out: NDArray[np.floating]) -> None:
+        light, size = self._light, self._size
+        light.propagate(opd_m, self._sensor)
+        spots = np.asarray(self._sensor.maps_intensity) / light.photons_per_unit
+        for (i, j), spot in zip(self._lit_lenslets, spots, strict=True):
+            box = out[self._y0[i] : self._y0[i] + size, self._x0[j] : self._x0[j] + size]
             # OOPAO's image of a lenslet has x along its rows.
-            out[y0[i] : y0[i] + size, x0[j] : x0[j] + size] += to_y[i] @ spot.T @ to_x[j].T
-        return out
-
-    def _spots(self, opd_m: NDArray[np.float32]) -> NDArray[np.float64]:
-        """OOPAO's images of the lit lenslets ``(n_lit, period, period)``."""
-        light = self._light
-        with suppress_output():
-            # '**' starts a new propagation; '*' would add to the last one.
-            light.source**light.telescope * oopao_classes().OPD_map(
-                np.asarray(opd_m, dtype=float)
-            ) * self._sensor
-            return np.asarray(self._sensor.maps_intensity) / light.photons_per_unit
+            box += self._to_y[i] @ spot.T @ self._to_x[j].T
 
 
 #: OOPAO's faces, numbered clockwise from the lower right, in the order of this package.
 _FACES = (2, 3, 1, 0)
 
 
-class OOPAOPyramid:
-    """OOPAO's propagation with the interface of ``PyramidOptics``.
+class OOPAOPyramid(ModulatedOptics):
+    """Pyramid optics by OOPAO's propagation.
 
     Parameters
     ----------
     amplitude, diameter_px, wavelength_m, centres_px, shape, modulation, rooftop, samples, grid_px
-        As for ``PyramidOptics``. OOPAO's grid contains two pupils side by side, so ``grid_px`` is at
+        As for :class:`PyramidOptics`. OOPAO's grid contains two pupils side by side, so ``grid_px`` is at
         least twice the pupil map's side.
     diameter_m
         Side of the pupil map in metres, needed for OOPAO's mirrors only.
@@ -266,8 +192,7 @@ class OOPAOPyramid:
         grid = next_fast_length(min_grid, samples) if grid_px is None else min_grid
         if grid % 2 or (grid_px is not None and grid != grid_px):
             raise ValueError(f"a grid of {grid_px} pixels; OOPAO needs an even number, at least {2 * side}")
-        self.shape = shape
-        self.amplitude = np.ascontiguousarray(amplitude, dtype=np.float32)
+        super().__init__(amplitude, shape)
         # OOPAO's unit of tilt is one wave between the centres of the outermost samples.
         self._unit = (n - 1) / (diameter_px * samples)
         self._region_on_camera = GridRegion(np.asarray(centres_px, dtype=float), shape, grid, 1)
@@ -283,37 +208,14 @@ class OOPAOPyramid:
             self.sensor.apply_shift_wfs(list(image_offsets[:, 0]), list(-image_offsets[:, 1]))
         self.modulation = modulation
 
-    @property
-    def modulation(self) -> ModulationPath:
-        """Path of the image over the pyramid; may be set between frames."""
-        return self._modulation
-
-    @modulation.setter
-    def modulation(self, modulation: ModulationPath) -> None:
-        self._modulation = modulation
+    def _apply_modulation(self, modulation: ModulationPath) -> None:
         tilts = modulation.points * self._unit
         with suppress_output():
             self.sensor.user_modulation_path = tilts.tolist()
             # OOPAO divides by the number of points in the field and again in the weighted sum.
-            self.sensor.weight_vector = modulation.weights * len(tilts) ** 2
+            self.sensor.weight_vector = np.full(len(tilts), modulation.weight * len(tilts) ** 2)
             self.sensor.modulation = float(np.hypot(*tilts.T).max())
 
-    def frame(
-        self, opd_m: NDArray[np.floating], image: NDArray[np.floating] | None = None
-    ) -> NDArray[np.floating]:
-        """Add the mean intensity ``(rows, columns)`` to ``image``, float32 zeros by default; return it.
-
-        ``opd_m (n, n)`` is the optical path difference in metres. The intensity sums to the sum of
-        ``amplitude ** 2``, except for light outside the region.
-        """
-        if opd_m.shape != self.amplitude.shape:
-            raise ValueError(f"the optical path has shape {opd_m.shape}, the pupil {self.amplitude.shape}")
-        out: NDArray[np.floating] = np.zeros(self.shape, np.float32) if image is None else image
-        light = self.light
-        with suppress_output():
-            # '**' starts a new propagation; '*' would add to the last one.
-            light.source**light.telescope * oopao_classes().OPD_map(
-                np.asarray(opd_m, dtype=float)
-            ) * self.sensor
-            self._region_on_camera.add(np.asarray(self.sensor.cam.frame) / light.photons_per_unit, out)
-        return out
+    def _add_intensity(self, opd_m: NDArray[np.floating], out: NDArray[np.floating]) -> None:
+        self.light.propagate(opd_m, self.sensor)
+        self._region_on_camera.add(np.asarray(self.sensor.cam.frame) / self.light.photons_per_unit, out)

@@ -2,30 +2,24 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 from scipy import special
 
 #: Largest mean for the Poisson tables; above it a Gaussian of the same mean and variance is accurate.
-MAX_TABLE_MEAN = 20.0
+_MAX_TABLE_MEAN = np.float32(20.0)
 #: Tables per unit of the mean, numbers per table, and starting points of the search in each table.
 _MEANS_PER_UNIT, _TABLE_LENGTH, _N_ENTRIES = 16, 64, 256
 
 
-def poisson_tables() -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-    """Build the tables of :func:`draw_poisson`.
+def _poisson_tables() -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+    """Tables of :func:`_draw_poisson` for means of 0, 1/16, 2/16, ...
 
-    Returns
-    -------
-    cumulative : ndarray of float32, ``(n_means, 64)``
-        Probability of at most ``k``, for means of 0, 1/16, 2/16, ...
-    entry : ndarray of uint8, ``(n_means, 256)``
-        First ``k`` to compare with a uniform number, by its first 8 bits.
+    The probability ``(n_means, 64)`` of at most ``k``, and the first ``k`` to compare with a uniform number,
+    by its first 8 bits ``(n_means, 256)``.
     """
-    means = np.arange(int(MAX_TABLE_MEAN * _MEANS_PER_UNIT) + 1) / _MEANS_PER_UNIT
+    means = np.arange(int(_MAX_TABLE_MEAN * _MEANS_PER_UNIT) + 1) / _MEANS_PER_UNIT
     exact = special.pdtr(np.arange(_TABLE_LENGTH), means[:, None])
     exact[:, -1] = 2.0  # ends every search
     starts = np.arange(_N_ENTRIES) / _N_ENTRIES
@@ -34,7 +28,7 @@ def poisson_tables() -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
 
 
 @njit(cache=True, nogil=True, inline="always")
-def uniform_pair(key, index):  # type: ignore[no-untyped-def]  # pragma: no cover
+def _uniform_pair(key, index):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Two uniform numbers in [0, 1): a hash of ``index`` under a 64-bit key, without state.
 
     Uses the finaliser of SplitMix64 (Steele, Lea and Flood 2014).
@@ -50,8 +44,8 @@ def uniform_pair(key, index):  # type: ignore[no-untyped-def]  # pragma: no cove
 
 
 @njit(cache=True, nogil=True, inline="always")
-def draw_poisson(mean, uniform_a, uniform_b, cumulative, entry):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Draw a Poisson number of a mean up to :data:`MAX_TABLE_MEAN` from two uniform numbers.
+def _draw_poisson(mean, uniform_a, uniform_b, cumulative, entry):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Draw a Poisson number of a mean up to 20 from two uniform numbers.
 
     The sum of two Poisson numbers: one whose mean is on the tables' grid, by inversion from the tabulated
     starting point, and one of the remaining mean, by inversion from zero.
@@ -78,9 +72,6 @@ def draw_poisson(mean, uniform_a, uniform_b, cumulative, entry):  # type: ignore
 #: Read noise in electrons above which faint light is treated as Gaussian: the skewness of the sum is
 #: below 0.385 / read noise, less than a tenth.
 COUNTING_NOISE_E = 4.0
-#: Largest excess noise factor, that of a long multiplication register.
-MAX_EXCESS_NOISE = math.sqrt(2)
-_MAX_TABLE_MEAN = np.float32(MAX_TABLE_MEAN)
 
 
 @njit(cache=True, fastmath=True, nogil=True)
@@ -121,8 +112,8 @@ def _expose_counting(settings, key, cumulative, entry):  # type: ignore[no-untyp
         if mean >= _MAX_TABLE_MEAN:
             value = mean + normal * np.sqrt(mean * excess2 + read2)
         else:
-            uniform_a, uniform_b = uniform_pair(key, k)
-            value = draw_poisson(mean, uniform_a, uniform_b, cumulative, entry)
+            uniform_a, uniform_b = _uniform_pair(key, k)
+            value = _draw_poisson(mean, uniform_a, uniform_b, cumulative, entry)
             if spread > 0 and value > 0:
                 # Gamma distribution of mean value and variance value x spread (Wilson and Hilferty 1931).
                 small = spread / (np.float32(9) * value)
@@ -144,10 +135,8 @@ class Detector:
 
     Parameters
     ----------
-    shape
-        Region (rows, columns).
-    bit_depth
-        Bits of the converter.
+    shape, bit_depth
+        Region (rows, columns), and bits of the converter.
     full_well_e
         Electrons at which a pixel saturates; full scale of the converter.
     read_noise_e, dark_e
@@ -156,16 +145,9 @@ class Detector:
         Mean black level in electrons, without shot noise.
     fixed_pattern
         Relative scatter of the pixels' gains; black levels scatter by this share of 100 counts.
-    rng
-        Source of randomness.
     excess_noise
         Excess noise factor F: shot noise is F times that of the light. 1 without multiplication, 1.25
         for an avalanche photodiode array, 1.41 for an electron-multiplying CCD.
-
-    Raises
-    ------
-    ValueError
-        ``excess_noise`` is not in 1..1.4143.
     """
 
     POOL = 1 << 22
@@ -182,8 +164,6 @@ class Detector:
         rng: np.random.Generator,
         excess_noise: float = 1.0,
     ) -> None:
-        if not 1 <= excess_noise <= MAX_EXCESS_NOISE + 1e-4:
-            raise ValueError(f"excess_noise is {excess_noise}; it must lie in 1..{MAX_EXCESS_NOISE:.4f}")
         size = shape[0] * shape[1]
         self.shape, self.top = shape, 2**bit_depth - 1
         self._rng = rng
@@ -195,7 +175,7 @@ class Detector:
         self._excess2 = np.float32(excess_noise**2)
         self._well = np.float32(full_well_e)
         self._noise = rng.standard_normal(max(self.POOL, 2 * size), dtype=np.float32)
-        self._tables = poisson_tables() if read_noise_e < COUNTING_NOISE_E else None
+        self._tables = _poisson_tables() if read_noise_e < COUNTING_NOISE_E else None
 
     def set_rng(self, rng: np.random.Generator) -> None:
         """Replace the source of randomness; gains, offsets and the pool of deviates are kept."""
@@ -204,21 +184,10 @@ class Detector:
     def expose(
         self, intensity: NDArray[np.float32], photons: float, sky_e: float = 0.0
     ) -> tuple[NDArray[np.uint16], int]:
-        """Expose one frame.
+        """Expose one frame; return its counts ``(rows, columns)`` and the number of saturated pixels.
 
-        Parameters
-        ----------
-        intensity
-            Relative intensity ``(rows, columns)``.
-        photons
-            Electrons per unit of intensity.
-        sky_e
-            Additional uniform light in electrons per pixel.
-
-        Returns
-        -------
-        frame : ndarray of uint16, ``(rows, columns)``
-        n_saturated : int
+        ``intensity (rows, columns)`` is multiplied by ``photons`` electrons; ``sky_e`` is additional uniform
+        light in electrons per pixel.
         """
         out = np.empty(self.shape, np.uint16)
         start = int(self._rng.integers(0, self._noise.size - intensity.size))

@@ -49,17 +49,14 @@ class FourierFilter:
     ----------
     transmission
         Factor ``(size, size)`` for each frequency, rows along y, in the order of a transform.
-    n
-        Side of the field.
-    rows
-        Number of output rows wanted, from row 0 on.
+    n, rows
+        Side of the field, and number of output rows wanted, from row 0 on.
 
     Attributes
     ----------
-    field
-        Input: ``[:n, :n]`` of a larger array; the rest must stay zero.
-    result
-        Output: ``[:rows, :size]`` of a larger array, ``size ** 2`` times numpy's inverse transform.
+    field, result
+        Input ``[:n, :n]`` of a larger array, whose rest must stay zero; output ``[:rows, :size]`` of a larger
+        array, ``size ** 2`` times numpy's inverse transform.
     """
 
     def __init__(self, transmission: NDArray[np.complexfloating], n: int, rows: int) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -29,73 +29,52 @@ def n_points(radius: float) -> int:
 
 @dataclass(frozen=True, eq=False)
 class ModulationPath:
-    """Positions of the image on the pyramid during one exposure.
+    """Positions of the image on the pyramid, evenly spaced in time over one exposure.
 
     Parameters
     ----------
     points
         Positions ``(k, 2)`` as (x, y) in lambda/D from the apex.
-    weights
-        Share of the exposure at each point ``(k,)``, normalised to sum to 1; equal by default.
 
     Raises
     ------
     ValueError
-        Points or weights have another shape, are not finite or negative.
+        The points have another shape or are not finite.
     """
 
     points: NDArray[np.float64]
-    weights: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
 
     def __post_init__(self) -> None:
         points = np.array(self.points, dtype=float)
         if points.ndim != 2 or points.shape[1] != 2 or not points.size or not np.isfinite(points).all():
             raise ValueError(f"modulation points have shape {points.shape}; they must be finite and (k, 2)")
-        weights = np.array(self.weights, dtype=float) if np.size(self.weights) else np.ones(len(points))
-        if weights.shape != (len(points),) or not (weights >= 0).all() or not weights.sum() > 0:
-            raise ValueError(
-                f"{len(points)} modulation points need as many weights, none negative and not all zero"
-            )
         object.__setattr__(self, "points", points)
-        object.__setattr__(self, "weights", weights / weights.sum())
 
     @property
-    def n_points(self) -> int:
-        """Number of points."""
-        return len(self.points)
+    def weight(self) -> float:
+        """Share of the exposure at each point."""
+        return 1 / len(self.points)
 
     @staticmethod
-    def circle(
-        radius: float,
-        points: int | None = None,
-        *,
-        ellipse: float = 0.0,
-        ellipse_angle: float = 0.0,
-        phase: float = 0.0,
-        centre: tuple[float, float] = (0.0, 0.0),
-    ) -> ModulationPath:
-        """Points evenly spaced in time on a circle or ellipse, by default from the +x axis on.
+    def circle(radius: float, *, ellipse: float = 0.0, ellipse_angle: float = 0.0) -> ModulationPath:
+        """A circle or ellipse around the apex with :func:`n_points` points; the apex for a radius of 0.
 
         Parameters
         ----------
-        radius, centre
-            Radius and centre (x, y) in lambda/D. With radius 0 the path is the centre.
-        points
-            Number of points; :func:`n_points` of the radius by default.
+        radius
+            Radius in lambda/D.
         ellipse, ellipse_angle
             Relative difference of the axes, ``radius (1 +- ellipse / 2)``, and direction of the longer
             axis in radians.
-        phase
-            Angle of the first point in radians.
         """
-        k = n_points(radius) if points is None else points
         if radius == 0:
-            return ModulationPath(np.array([centre], dtype=float))
-        angle = 2 * np.pi * np.arange(k) / k + phase - ellipse_angle
+            return ModulationPath(np.zeros((1, 2)))
+        k = n_points(radius)
+        angle = 2 * np.pi * np.arange(k) / k - ellipse_angle
         along = radius * (1 + ellipse / 2) * np.cos(angle)
         across = radius * (1 - ellipse / 2) * np.sin(angle)
         c, s = np.cos(ellipse_angle), np.sin(ellipse_angle)
-        return ModulationPath(np.stack([c * along - s * across, s * along + c * across], axis=1) + centre)
+        return ModulationPath(np.stack([c * along - s * across, s * along + c * across], axis=1))
 
 
 #: Reads duration and positions of an emulated stage's cycle; converts such positions to tilts.
@@ -118,13 +97,9 @@ class BeamPath:
     def follow_stage(self, read_cycle: _CycleReader, to_tilt: _TiltConverter) -> None:
         """Let an emulated stage move the beam from now on; ``modulation`` is ignored.
 
-        Parameters
-        ----------
-        read_cycle
-            Returns the duration of a cycle in seconds and positions over it ``(k, 2)``, or None at rest;
-            the same object until something changes.
-        to_tilt
-            Converts positions to tilts (x, y) in radians.
+        ``read_cycle`` returns the duration of a cycle in seconds and positions over it ``(k, 2)``, or None
+        at rest; the same object until something changes. ``to_tilt`` converts positions to tilts (x, y) in
+        radians.
         """
         self._emulated = (read_cycle, to_tilt)
 

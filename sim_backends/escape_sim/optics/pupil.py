@@ -34,16 +34,7 @@ def pupil_transmission(
 
     The contaminated arc transmits ``contamination.transmission``. The unevenness is a sum of random
     waves, none shorter than a fifth of the diameter. The radius of the pupil varies likewise around its
-    circumference, always inwards.
-
-    Parameters
-    ----------
-    contamination
-        The settings ``twin.contamination``.
-    diameter_m, coordinates_m
-        Pupil diameter, and coordinates ``(n,)`` of the samples along either axis, in metres.
-    rng
-        Source of randomness.
+    circumference, always inwards. ``coordinates_m (n,)`` are those of the samples along either axis.
     """
     u = coordinates_m / (diameter_m / 2)
     x, y = np.meshgrid(u, u)
@@ -87,24 +78,15 @@ _MIN_TRANSMISSION = 1e-3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PupilGeometry:
-    """Sampled pupil of a system.
+    """Sampled pupil of a system."""
 
-    Parameters
-    ----------
-    n_sub, n_pix
-        Sub-apertures across the pupil, and samples across each of them.
-    sub_aperture_m
-        Size of a sub-aperture in metres.
-    coordinates_m
-        Coordinates of the samples along either axis ``(n,)`` in metres, from the grid's centre.
-    amplitude
-        Amplitude ``(n, n)`` of the beam inside the round pupil, 1 at its maximum.
-    """
-
+    #: Sub-apertures across the pupil, and samples across each of them.
     n_sub: int
     n_pix: int
     sub_aperture_m: float
+    #: Coordinates of the samples along either axis ``(n,)`` in metres, from the grid's centre.
     coordinates_m: NDArray[np.float64]
+    #: Amplitude ``(n, n)`` of the beam inside the round pupil, 1 at its maximum.
     amplitude: NDArray[np.float32]
 
     @property

@@ -7,13 +7,13 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 from escape_hw.api.concurrency import helper_threads_allowed
+from escape_sim.optics.base import ModulatedOptics
 from escape_sim.optics.fourier_filter import FourierFilter, is_fast_length, next_fast_length
 from escape_sim.optics.modulation import ModulationPath
 from escape_sim.optics.shack_hartmann import pupil_field
@@ -27,24 +27,18 @@ class Prism:
     face. The surface is the highest of the four planes everywhere, as in OOPAO's
     ``Pyramid.get_phase_mask``, so faces of unequal tilt meet along edges that are not quite square.
 
-    Parameters
-    ----------
-    shifts
-        Shift ``(4, 2)`` as (x, y) of each image in pupil samples: upper left, upper right, lower
-        left, lower right.
-    diameter
-        Pupil diameter in samples.
-    rooftop
-        Length in lambda/D of the ridge that replaces the apex; negative for the other diagonal.
-
     Raises
     ------
     ValueError
-        The shifts are not four finite points in this order.
+        The shifts are not four finite points in their order.
     """
 
+    #: Shift ``(4, 2)`` as (x, y) of each image in pupil samples: upper left, upper right, lower left, lower
+    #: right.
     shifts: NDArray[np.float64]
+    #: Pupil diameter in samples.
     diameter: float
+    #: Length in lambda/D of the ridge; negative for the other diagonal.
     rooftop: float = 0.0
 
     def __post_init__(self) -> None:
@@ -256,10 +250,8 @@ class SeparableKernel:
 #: Threads that share the modulation points of a frame; fixed, so that rounding is the same everywhere.
 WORKERS = 2
 
-Method = Literal["auto", "separable", "fourier"]
 
-
-class PyramidOptics:
+class PyramidOptics(ModulatedOptics):
     """Pyramid sensor: four images of the pupil on one camera.
 
     A camera pixel is one pupil sample, or a whole number of them. A positive slope of the optical path
@@ -274,24 +266,17 @@ class PyramidOptics:
         Pupil amplitude ``(n, n)``, ``n`` even.
     diameter_px
         Diameter of a pupil image in camera pixels, which defines lambda/D.
-    wavelength_m
-        Wavelength in metres.
     centres_px
         Centres ``(4, 2)`` as (x, y) of the pupil images on the region in camera pixels: upper left,
         upper right, lower left, lower right.
     shape
         Camera region (rows, columns). Light outside it is lost.
-    modulation
-        Path of the image over the pyramid.
     rooftop
-        Length of the ridge in place of the apex in lambda/D; negative for the other diagonal.
+        Length in lambda/D of the ridge that replaces the apex; negative for the other diagonal.
     samples
         Pupil samples across a camera pixel.
     grid_px
         Side of the periodic grid in camera pixels; by default the next fast length for the region.
-    method
-        ``separable`` (matrix products, for images on a rectangle only) or ``fourier``; the faster one
-        by default. Both give the same frames in single precision.
 
     Raises
     ------
@@ -311,15 +296,13 @@ class PyramidOptics:
         rooftop: float = 0.0,
         samples: int = 1,
         grid_px: int | None = None,
-        method: Method = "auto",
     ) -> None:
         n = amplitude.shape[0]
         if amplitude.shape != (n, n) or n % 2:
             raise ValueError(f"amplitude has shape {amplitude.shape}; it must be square, of even side")
         if samples < 1 or not diameter_px > 0:
             raise ValueError(f"{samples} samples per pixel, {diameter_px} pixels; both must be positive")
-        self.shape = shape
-        self.amplitude = np.ascontiguousarray(amplitude, dtype=np.float32)
+        super().__init__(amplitude, shape)
         self._diameter, self.wavelength_m = diameter_px * samples, wavelength_m
         grid = next_fast_length(max(shape), samples) if grid_px is None else grid_px
         if grid * samples < n or grid * samples % 2:
@@ -328,42 +311,25 @@ class PyramidOptics:
             )
         self._region_on_camera = GridRegion(np.asarray(centres_px, dtype=float), shape, grid, samples)
         self.prism = Prism(self._region_on_camera.shifts(n), self._diameter, rooftop)
-        self._kernels = self._make_kernels(n, grid * samples, method)
+        self._kernels = self._make_kernels(n, grid * samples)
         self._field = np.empty((n, n), np.complex64)
         self._power = np.empty((WORKERS, *self._kernels[0].shape), np.float32)
         self._executor = ThreadPoolExecutor(WORKERS - 1, "pyramid") if helper_threads_allowed() else None
         self.modulation = modulation
 
-    @property
-    def modulation(self) -> ModulationPath:
-        """Path of the image over the pyramid; may be set between frames."""
-        return self._modulation
-
-    @modulation.setter
-    def modulation(self, modulation: ModulationPath) -> None:
-        self._modulation = modulation
+    def _apply_modulation(self, modulation: ModulationPath) -> None:
         kernel = self._kernels[0]
         tilts_per_sample = modulation.points / self._diameter
         x, y = kernel.tilts(tilts_per_sample[:, 0]), kernel.tilts(tilts_per_sample[:, 1])
-        y *= np.sqrt(modulation.weights).astype(np.float32)[:, None]
+        y *= np.float32(np.sqrt(modulation.weight))
         self._tilts = [(x[k::WORKERS], y[k::WORKERS]) for k in range(WORKERS)]
 
     @property
-    def method(self) -> Method:
-        """Method in use, ``separable`` or ``fourier``."""
-        return "separable" if isinstance(self._kernels[0], SeparableKernel) else "fourier"
+    def uses_matrix_products(self) -> bool:
+        """Whether the light is propagated by matrix products instead of Fourier transforms."""
+        return isinstance(self._kernels[0], SeparableKernel)
 
-    def frame(
-        self, opd_m: NDArray[np.float32], image: NDArray[np.float32] | None = None
-    ) -> NDArray[np.float32]:
-        """Add the mean intensity ``(rows, columns)`` to ``image``, a new array by default, and return it.
-
-        ``opd_m (n, n)`` is the optical path difference in metres. The intensity sums to the sum of
-        ``amplitude ** 2``, except for light outside the region.
-        """
-        if opd_m.shape != self.amplitude.shape:
-            raise ValueError(f"the optical path has shape {opd_m.shape}, the pupil {self.amplitude.shape}")
-        out = np.zeros(self.shape, np.float32) if image is None else image
+    def _add_intensity(self, opd_m: NDArray[np.floating], out: NDArray[np.floating]) -> None:
         opd = np.ascontiguousarray(opd_m, dtype=np.float32)
         field = self._field.view(np.float32).reshape(-1, 2)
         pupil_field(opd.ravel(), 1 / self.wavelength_m, self.amplitude.ravel(), field)
@@ -377,7 +343,6 @@ class PyramidOptics:
                 future.result()
         for power in self._power:
             self._region_on_camera.add(power, out)
-        return out
 
     def _propagate_share(self, worker: int) -> None:
         """Compute the power of one worker's modulation points."""
@@ -385,18 +350,11 @@ class PyramidOptics:
         power.fill(0)
         self._kernels[worker].add(self._field, *self._tilts[worker], power)
 
-    def _make_kernels(self, n: int, n_grid: int, method: Method) -> list[SeparableKernel | FourierKernel]:
+    def _make_kernels(self, n: int, n_grid: int) -> list[SeparableKernel] | list[FourierKernel]:
         half_distances = self.prism.half_distances((n_grid - n) / 2)
-        if method == "separable" and half_distances is None:
-            raise ValueError(
-                "the images are not on a rectangle around the grid's centre; use method 'fourier'"
-            )
-        if half_distances is not None and (
-            method == "separable" or (method == "auto" and _matrix_product_is_faster(n, n_grid))
-        ):
+        if half_distances is not None and _matrix_product_is_faster(n, n_grid):
             return [SeparableKernel(*half_distances, n, n_grid) for _ in range(WORKERS)]
-        rows = self._region_on_camera.rows
-        return [FourierKernel(self.prism, n, n_grid, rows) for _ in range(WORKERS)]
+        return [FourierKernel(self.prism, n, n_grid, self._region_on_camera.rows) for _ in range(WORKERS)]
 
 
 class GridRegion:

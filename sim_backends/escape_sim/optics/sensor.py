@@ -2,85 +2,48 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Protocol, runtime_checkable
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
-from escape_hw.config.sensor import PyramidSection, ShackHartmannSection
+from escape_hw.config.sensor import PyramidSection
+from escape_sim.optics.base import SensorOptics
 from escape_sim.optics.modulation import ModulationPath
 from escape_sim.optics.pupil import PupilGeometry
 from escape_sim.optics.pyramid import PyramidOptics
-from escape_sim.optics.shack_hartmann import ShackHartmannOptics
+from escape_sim.optics.shack_hartmann import LensletOptics, ShackHartmannOptics
 
 if TYPE_CHECKING:
     from escape_hw.config.system import SystemConfig
     from escape_sim.oopao.optics import OOPAOPyramid
 
 
-class SensorOptics(Protocol):
-    """Optics of a wavefront sensor: from optical path in metres to relative intensity."""
-
-    def frame(
-        self, opd_m: NDArray[np.float32], image: NDArray[np.float32] | None = None
-    ) -> NDArray[np.float32]:
-        """Add the intensity to ``image`` and return it."""
-
-
-@runtime_checkable
-class ModulatedOptics(SensorOptics, Protocol):
-    """Optics of a pyramid, whose modulation path may be set between frames."""
-
-    modulation: ModulationPath
-
-
 def make_sensor_optics(config: SystemConfig, pupil: PupilGeometry) -> SensorOptics:
-    """Build the true optics of the twin's sensor, which differ from the design as ``twin`` says."""
-    amplitude = pupil.amplitude / np.sqrt(np.sum(np.square(pupil.amplitude, dtype=float)))
-    if isinstance(config.sensor, PyramidSection):
-        return make_pyramid(config, config.sensor, pupil, amplitude.astype(np.float32))
-    return _make_lenslets(config, config.sensor, pupil, amplitude.astype(np.float32))
+    """Build the true optics of the twin's sensor, which differ from the design as ``twin`` says.
 
-
-def make_pyramid(
-    config: SystemConfig, sensor: PyramidSection, pupil: PupilGeometry, amplitude: NDArray[np.float32]
-) -> PyramidOptics | OOPAOPyramid:
-    """Build a pyramid without modulation, with its images at their true positions."""
-    optics_class: type[PyramidOptics | OOPAOPyramid] = PyramidOptics
+    A pyramid is without modulation, with its images at their true positions.
+    """
+    pyramid_class: type[PyramidOptics | OOPAOPyramid] = PyramidOptics
+    lenslet_class: type[LensletOptics] = ShackHartmannOptics
     if config.system.optics == "oopao":
         # Imported here: OOPAO takes two seconds and 1,600 modules to load.
-        from escape_sim.oopao.optics import OOPAOPyramid
+        from escape_sim.oopao.optics import OOPAOPyramid, OOPAOShackHartmann
 
-        optics_class = OOPAOPyramid
-    twin = config.twin.pyramid
-    width, height = config.devices.wfs.region[2:]
-    return optics_class(
-        amplitude,
-        float(pupil.n_sub),
-        config.system.wavelength_m,
-        np.add(sensor.pupils_px, twin.centre_offsets_px),
-        (height, width),
-        ModulationPath.circle(0.0),
-        rooftop=twin.rooftop,
-        samples=pupil.n_pix,
+        pyramid_class, lenslet_class = OOPAOPyramid, OOPAOShackHartmann
+    amplitude = pupil.amplitude / np.sqrt(np.sum(np.square(pupil.amplitude, dtype=float)))
+    amplitude = amplitude.astype(np.float32)
+    sensor, wavelength_m, shape = config.sensor, config.system.wavelength_m, config.devices.wfs.region[:1:-1]
+    if isinstance(sensor, PyramidSection):
+        twin = config.twin.pyramid
+        return pyramid_class(
+            amplitude, float(pupil.n_sub), wavelength_m, np.add(sensor.pupils_px, twin.centre_offsets_px),
+            shape, ModulationPath.circle(0.0), rooftop=twin.rooftop, samples=pupil.n_pix,
+        )  # fmt: skip
+    pitch = config.twin.wfs.pitch_px or sensor.pitch_px
+    x, y = (
+        (length - 1) / 2 - pitch * (sensor.n_sub - 1) / 2 + offset
+        for length, offset in zip(shape[::-1], config.twin.wfs.grid_offset_px, strict=True)
     )
-
-
-def _make_lenslets(
-    config: SystemConfig, sensor: ShackHartmannSection, pupil: PupilGeometry, amplitude: NDArray[np.float32]
-) -> SensorOptics:
-    c, twin = config, config.twin.wfs
-    n_sub, pitch = sensor.n_sub, twin.pitch_px or sensor.pitch_px
-    width, height = c.devices.wfs.region[2:]
-    origin = (
-        (width - 1) / 2 - pitch * (n_sub - 1) / 2 + twin.grid_offset_px[0],
-        (height - 1) / 2 - pitch * (n_sub - 1) / 2 + twin.grid_offset_px[1],
+    return lenslet_class(
+        sensor.n_sub, pupil.n_pix, wavelength_m, pitch, sensor.spot_px, (x, y), shape, amplitude
     )
-    geometry = (
-        n_sub, pupil.n_pix, c.system.wavelength_m, pitch, sensor.spot_px, origin, (height, width), amplitude,
-    )  # fmt: skip
-    if c.system.optics == "oopao":
-        from escape_sim.oopao.optics import OOPAOShackHartmann
-
-        return OOPAOShackHartmann(*geometry)
-    return ShackHartmannOptics(*geometry)

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import abc
 import math
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
+
+from escape_sim.optics.base import SensorOptics
 
 # Taylor coefficients of sin(x) and cos(x) for |x| <= pi/2; the error of 6e-8 is that of float32.
 _S3, _S5, _S7, _S9, _S11 = (-1 / 6, 1 / 120, -1 / 5040, 1 / 362880, -1 / 39916800)
@@ -82,8 +85,8 @@ def lenslet_transform(
     return np.asarray(np.exp(phase) / np.sqrt(n_pix * spot_px), dtype=np.complex128)
 
 
-class ShackHartmannOptics:
-    """Shack-Hartmann sensor on a camera whose pixels need not match the lenslets.
+class LensletOptics(SensorOptics):
+    """Geometry of a Shack-Hartmann sensor on a camera whose pixels need not match the lenslets.
 
     Every lenslet forms an image on the ``field`` pixels around it; images of neighbours add as
     intensities. A positive slope of the optical path along x moves spots to higher columns.
@@ -92,8 +95,6 @@ class ShackHartmannOptics:
     ----------
     n_sub, n_pix
         Lenslets across the grid, and pupil samples across a lenslet.
-    wavelength_m
-        Wavelength in metres.
     pitch_px, spot_px
         Lenslet pitch and lambda/d in camera pixels.
     origin_px
@@ -125,54 +126,49 @@ class ShackHartmannOptics:
             raise ValueError(
                 f"amplitude has shape {amplitude.shape}; {n_sub} x {n_pix} samples need ({n}, {n})"
             )
-        field = field_pixels(n_pix, spot_px)
-        line = np.arange(n_sub) * pitch_px
-        x, y = origin_px[0] + line, origin_px[1] + line
-        x0, y0 = first_pixels(x, field), first_pixels(y, field)
-        light = amplitude.reshape(n_sub, n_pix, n_sub, n_pix).any(axis=(1, 3))
-        rows, cols = np.nonzero(light)
-        inside = (
-            (y0[rows] >= 0)
-            & (x0[cols] >= 0)
-            & (y0[rows] + field <= shape[0])
-            & (x0[cols] + field <= shape[1])
-        )
-        if not inside.all():
+        super().__init__(amplitude, shape)
+        self._n_sub, self._n_pix, self._size = n_sub, n_pix, field_pixels(n_pix, spot_px)
+        self._x, self._y = (origin + np.arange(n_sub) * pitch_px for origin in origin_px)
+        self._x0, self._y0 = (first_pixels(centres, self._size) for centres in (self._x, self._y))
+        self._lit = amplitude.reshape(n_sub, n_pix, n_sub, n_pix).any(axis=(1, 3))
+        outside = np.zeros_like(self._lit)
+        outside |= (self._x0 < 0) | (self._x0 + self._size > shape[1])
+        outside |= ((self._y0 < 0) | (self._y0 + self._size > shape[0]))[:, None]
+        if (outside & self._lit).any():
             raise ValueError(
-                f"{int((~inside).sum())} lit lenslets fall outside the region "
+                f"{int((outside & self._lit).sum())} lit lenslets fall outside the region "
                 f"of {shape[1]} x {shape[0]} pixels; enlarge the camera region or move the grid's origin"
             )
-        self.shape = shape
-        self.amplitude = np.ascontiguousarray(amplitude, dtype=np.float32)
+        self._prepare(wavelength_m, spot_px)
+
+    @abc.abstractmethod
+    def _prepare(self, wavelength_m: float, spot_px: float) -> None:
+        """Compute what is the same for every frame."""
+
+
+class ShackHartmannOptics(LensletOptics):
+    """Diffractive Shack-Hartmann optics; parameters of :class:`LensletOptics`."""
+
+    def _prepare(self, wavelength_m: float, spot_px: float) -> None:
+        k, p, f = self._n_sub, self._n_pix, self._size
         self._per_wave = np.float32(1 / wavelength_m)
-        self._lit, self._x0, self._y0 = light, x0, y0
-        self._along_x = lenslet_transform(x, x0, n_pix, field, spot_px).astype(np.complex64)
-        along_y = lenslet_transform(y, y0, n_pix, field, spot_px).astype(np.complex64)
+        self._along_x = lenslet_transform(self._x, self._x0, p, f, spot_px).astype(np.complex64)
+        along_y = lenslet_transform(self._y, self._y0, p, f, spot_px).astype(np.complex64)
         self._along_y = np.ascontiguousarray(along_y.transpose(0, 2, 1))
-        self._field = np.empty((n, n), np.complex64)
-        self._half = np.empty((n, n_sub, field), np.complex64)
-        self._spots = np.empty((n_sub, field, n_sub * field), np.complex64)
-        self._n_sub, self._n_pix, self._size = n_sub, n_pix, field
+        self._field = np.empty((k * p, k * p), np.complex64)
+        self._half = np.empty((k * p, k, f), np.complex64)
+        self._spots = np.empty((k, f, k * f), np.complex64)
 
-    def frame(
-        self, opd_m: NDArray[np.float32], image: NDArray[np.float32] | None = None
-    ) -> NDArray[np.float32]:
-        """Add the intensity ``(rows, columns)`` to ``image``, a new array by default, and return it.
-
-        ``opd_m (n, n)`` is the optical path difference in metres. The intensity sums to the sum of
-        ``amplitude ** 2``, except for light outside the field of a lenslet.
-        """
-        out = np.zeros(self.shape, np.float32) if image is None else image
+    def _add_intensity(self, opd_m: NDArray[np.floating], out: NDArray[np.floating]) -> None:
         opd = np.ascontiguousarray(opd_m, dtype=np.float32)
-        n, k, p, f = opd.shape[0], self._n_sub, self._n_pix, self._size
+        k, p, f = self._n_sub, self._n_pix, self._size
         pupil_field(
             opd.ravel(), self._per_wave, self.amplitude.ravel(), self._field.view(np.float32).reshape(-1, 2)
         )
         # One product per lenslet column, then one per lenslet row.
-        columns = self._field.reshape(n, k, p).transpose(1, 0, 2)
+        columns = self._field.reshape(k * p, k, p).transpose(1, 0, 2)
         np.matmul(columns, self._along_x, out=self._half.transpose(1, 0, 2))
         np.matmul(self._along_y, self._half.reshape(k, p, k * f), out=self._spots)
         _add_intensities(
             self._spots.view(np.float32).reshape(k, f, k, f, 2), self._lit, self._y0, self._x0, out
         )
-        return out

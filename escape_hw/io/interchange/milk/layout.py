@@ -128,16 +128,9 @@ class Sections:
 
 
 def compute_sections(head: Metadata, step: int, header_bytes: int = HEADER_BYTES) -> Sections:
-    """Where the sections of a file lie.
+    """Where the sections of a file with this header lie.
 
-    Parameters
-    ----------
-    head
-        Its metadata.
-    step
-        Sections begin at multiples of this: 8 in later releases, 1 in the first of 2.00.
-    header_bytes
-        Length of the metadata.
+    They begin at multiples of ``step``: 8 in later releases, 1 in the first of 2.00.
     """
     n, at, starts = int(head.sem), header_bytes, []
     stamped = int(head.size[2]) if head.imagetype & _STAMPED_MASK == _STAMPED else 0

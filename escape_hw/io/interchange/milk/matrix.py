@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from escape_hw.api.results import CalibrationResult
+from escape_hw.io.fits.extensions import reference_slopes
 
 
 def calibration_images(
@@ -15,12 +16,7 @@ def calibration_images(
 ) -> dict[str, NDArray[Any]]:
     """The calibration as arrays by the ending of their names.
 
-    Parameters
-    ----------
-    result
-        The calibration.
-    layout
-        Map of the actuators; ``None`` where they are not on a grid.
+    ``actuator_map`` is ``None`` where the actuators are not on a grid.
 
     Returns
     -------
@@ -39,8 +35,5 @@ def calibration_images(
         dm[:, actuator_map] = modes
         modes = dm
     references = np.zeros(mask.shape, np.float32)
-    reference_slopes = np.asarray(
-        getattr(grid, "references_px", getattr(grid, "references", None)), np.float32
-    )
-    references[mask] = reference_slopes.T.ravel()
+    references[mask] = reference_slopes(grid).T.ravel()
     return {"wfs": wfs, "dm": modes, "mask": mask.astype(np.uint8), "ref": references}

@@ -25,17 +25,7 @@ _FREE = -1
 
 
 class Semaphores:
-    """The semaphores of an image.
-
-    Parameters
-    ----------
-    memory
-        The whole file.
-    sections
-        Where its sections begin.
-    n
-        How many semaphores it has.
-    """
+    """The ``n`` semaphores of an image, in the memory of its file."""
 
     def __init__(self, memory: mmap.mmap, sections: layout.Sections, n: int) -> None:
         self._buffer = ctypes.c_char.from_buffer(memory)
@@ -46,7 +36,8 @@ class Semaphores:
         self._writers = np.ndarray((n,), np.int32, memory, sections.writers)
         self._is_aligned = sections.semaphores % _ALIGNMENT == 0
         self._own_index: int | None = None
-        self._c_library = _c_library()
+        # milk uses the semaphores of the C library.
+        self._c_library = ctypes.CDLL(None, use_errno=True)
 
     def initialise(self) -> None:
         """Make them, all at zero and free."""
@@ -108,23 +99,8 @@ def _process_exists(pid: int) -> bool:
     return True
 
 
-def _c_library() -> Any:
-    """The C library of this process; milk uses its semaphores."""
-    return ctypes.CDLL(None, use_errno=True)
-
-
 class Slices:
-    """Offsets of the newest array of an image and of the next one.
-
-    Parameters
-    ----------
-    memory
-        The whole file.
-    head
-        Its metadata, in place.
-    sections
-        Where its sections begin.
-    """
+    """The newest array of an image and the place of the next one, in the memory of its file."""
 
     def __init__(self, memory: mmap.mmap, head: layout.Metadata, sections: layout.Sections) -> None:
         image, dtype = layout.image_shape(head), layout.DTYPES[head.datatype]
@@ -194,13 +170,6 @@ class MilkStream:
 
     Made by :meth:`open` or :meth:`create`. A reader waits on one of the image's semaphores, which it marks
     as its own and gives back on closing. Of a circular buffer, the arrays are its slices.
-
-    Parameters
-    ----------
-    name
-        Name of the image.
-    memory
-        Its whole file.
     """
 
     def __init__(self, name: str, memory: mmap.mmap) -> None:
@@ -246,12 +215,9 @@ class MilkStream:
 
         All users may write to it, as to images made by milk.
 
-        Parameters
-        ----------
-        name, shape, dtype
-            See :func:`~escape_hw.io.interchange.milk.layout.build_metadata`.
-        version
-            Version in the metadata. milk opens only images of its own version.
+        ``name``, ``shape`` and ``dtype`` are those of
+        :func:`~escape_hw.io.interchange.milk.layout.build_metadata`. milk opens only images of its own
+        version.
 
         Raises
         ------

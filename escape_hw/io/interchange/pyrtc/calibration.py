@@ -36,18 +36,8 @@ from escape_hw.io.storage import write_atomic
 class TargetSystem:
     """The system of ours that a calibration is read for.
 
-    Parameters
-    ----------
-    system
-        Its name.
-    kind
-        Kind of its sensor.
-    n_sub
-        Sub-apertures across its pupil.
-    n_act
-        Number of its actuators.
-    simulated
-        Whether what comes in counts as simulated.
+    ``kind`` is that of its sensor, ``n_sub`` the sub-apertures across its pupil; ``simulated`` marks the
+    result as simulated.
     """
 
     system: str
@@ -209,13 +199,9 @@ def import_matrix(
 
     Parameters
     ----------
-    config
-        The configuration.
-    target
-        The system it is read for.
     im
         Another interaction matrix than ``loop.im_file``.
-    way
+    frame_order
         How files of pyRTC 1.x were made, see :mod:`~escape_hw.io.interchange.pyrtc.files`.
 
     Raises
@@ -331,12 +317,7 @@ _MAX_RESIDUAL = 1e-6
 class FrameSettings:
     """Camera properties that pyRTC needs besides the geometry.
 
-    Parameters
-    ----------
-    shape
-        Frame (rows, columns).
-    threshold
-        Counts below which a pixel of a spot counts as dark.
+    ``shape`` is the frame (rows, columns); below ``threshold``, in counts, a pixel of a spot counts as dark.
     """
 
     shape: tuple[int, int]
@@ -346,12 +327,7 @@ class FrameSettings:
 def convert_basis(matrix: InteractionMatrix, m2c: NDArray[np.float64]) -> InteractionMatrix:
     """The matrix for other modes in the span of its own.
 
-    Parameters
-    ----------
-    matrix
-        ``D`` for the modes ``M``.
-    m2c
-        Requested modes ``M' (n_act, n)``: the result is ``D M^+ M'``.
+    Of the matrix ``D`` for the modes ``M`` it is ``D M^+ M'``, with the requested modes ``M' (n_act, n)``.
 
     Raises
     ------
@@ -367,9 +343,8 @@ def convert_basis(matrix: InteractionMatrix, m2c: NDArray[np.float64]) -> Intera
     if outside.max(initial=0.0) > _MAX_RESIDUAL:
         raise IncompatibleProduct(
             f"mode {int(outside.argmax())} of those requested is not a linear combination of the "
-            f"matrix's {matrix.n_modes} modes "
-            f"({outside.max():.2g} of it is left over); calibrate with basis.n_modes={m2c.shape[0]}, or take "
-            "the matrix's own modes"
+            f"matrix's {matrix.n_modes} modes ({outside.max():.2g} of it is left over); calibrate with "
+            f"basis.n_modes={m2c.shape[0]}, or take the matrix's own modes"
         )
     data = (matrix.data.astype(float) @ transform).astype(np.float32)
     variance = np.square(matrix.sigma.astype(float)) @ np.square(transform)
@@ -382,16 +357,10 @@ def convert_basis(matrix: InteractionMatrix, m2c: NDArray[np.float64]) -> Intera
 def export_matrix(
     folder: Path, result: CalibrationResult, frame: FrameSettings, m2c: NDArray[np.float64] | None = None
 ) -> dict[str, Path]:
-    """Write matrix, mask, references, modes and the settings that go with them.
+    """Write matrix, mask, references, modes and the settings that go with them; files are replaced.
 
     Parameters
     ----------
-    folder
-        Where; files of these names are replaced.
-    result
-        The calibration.
-    facts
-        The camera's.
     m2c
         Modes that pyRTC's commands are to mean ``(n_act, n_modes)``; the matrix's own by default.
 
@@ -411,7 +380,17 @@ def export_matrix(
     slopes, mask, references, (data, sigma) = _sensor_parts(result.grid, frame, matrix)
     paths = {name: folder / file for name, file in _FILE_NAMES.items()}
     kind = {"wfs_type": "pywfs" if isinstance(result.grid, PyramidPupils) else "shwfs"}
-    write_file(paths["im"], data, MATRIX, _record(result, matrix), {"sigma": sigma})
+    record = {
+        "system": matrix.system,
+        "method": matrix.method,
+        "simulated": matrix.simulated,
+        "slope_unit": matrix.slope_unit,
+        "frames": result.frames,
+        "lost_frames": result.lost_frames,
+        "delay_frames": None if result.response is None else result.response.delay,
+        **registration_document(result.registration),
+    }
+    write_file(paths["im"], data, MATRIX, record, {"sigma": sigma})
     write_file(paths["valid"], mask, VALID, kind)
     write_file(paths["references"], references, REFERENCES, kind)
     write_array(paths["m2c"], matrix.m2c)
@@ -425,7 +404,15 @@ def export_matrix(
         "loop": {"im_file": _FILE_NAMES["im"]},
     }
     paths["settings"] = folder / SETTINGS_FILE
-    write_atomic(paths["settings"], _to_yaml(sections).encode())
+    yaml_lines = ["# Written by ESCAPE: merge these keys into pyRTC's configuration, in this folder."]
+    for name, values in sections.items():
+        yaml_lines.append(f"{name}:")
+        for key, value in values.items():
+            if isinstance(value, list):
+                yaml_lines += [f"  {key}:", *(f'  - "{item}"' for item in value)]
+            else:
+                yaml_lines.append(f"  {key}: {value}")
+    write_atomic(paths["settings"], ("\n".join(yaml_lines) + "\n").encode())
     return paths
 
 
@@ -460,30 +447,3 @@ def _sensor_parts(
         "ref_slopes_file": _FILE_NAMES["references"],
     }
     return section, windows.mask_of(lenslets), windows.references_of(lenslets), both
-
-
-def _record(result: CalibrationResult, matrix: InteractionMatrix) -> dict[str, Any]:
-    """Description of the matrix for readers of the file."""
-    return {
-        "system": matrix.system,
-        "method": matrix.method,
-        "simulated": matrix.simulated,
-        "slope_unit": matrix.slope_unit,
-        "frames": result.frames,
-        "lost_frames": result.lost_frames,
-        "delay_frames": None if result.response is None else result.response.delay,
-        **registration_document(result.registration),
-    }
-
-
-def _to_yaml(sections: dict[str, dict[str, Any]]) -> str:
-    """Sections of plain values as YAML."""
-    lines = ["# Written by ESCAPE: merge these keys into pyRTC's configuration, in this folder."]
-    for name, values in sections.items():
-        lines.append(f"{name}:")
-        for key, value in values.items():
-            if isinstance(value, list):
-                lines += [f"  {key}:", *(f'  - "{item}"' for item in value)]
-            else:
-                lines.append(f"  {key}: {value}")
-    return "\n".join(lines) + "\n"

@@ -31,16 +31,7 @@ _RECORD, _DATA = "pyrtc_calibration", "data"
 class PyrtcFile:
     """An array of pyRTC with the metadata of its file.
 
-    Parameters
-    ----------
-    path
-        Where it was read.
-    data
-        The array.
-    record
-        The record; ``None`` for a file of pyRTC 1.x, which has none.
-    more
-        Further arrays of the archive, which pyRTC does not read.
+    ``record`` is ``None`` for a file of pyRTC 1.x; pyRTC does not read ``extra_arrays`` of the archive.
     """
 
     path: Path
@@ -59,8 +50,6 @@ def read_file(path: Path | str, kind: str | None = None) -> PyrtcFile:
 
     Parameters
     ----------
-    path
-        The file; its ending does not matter.
     kind
         Expected kind, checked where the file gives one: :data:`MATRIX`, :data:`VALID` or :data:`REFERENCES`.
 
@@ -117,18 +106,9 @@ def write_file(
     record: Mapping[str, Any] | None = None,
     extra_arrays: Mapping[str, NDArray[Any]] | None = None,
 ) -> Path:
-    """Write a calibration file that pyRTC 2.x reads; whole or not at all.
+    """Write a calibration file of a kind that pyRTC 2.x reads, atomically and under exactly this name.
 
-    Parameters
-    ----------
-    path
-        Exactly this name.
-    data
-        The array.
-    kind
-        :data:`MATRIX`, :data:`VALID` or :data:`REFERENCES`.
-    record, more
-        Further entries of the record and further arrays, which pyRTC does not read.
+    pyRTC reads neither ``record``, further entries of the record, nor ``extra_arrays``.
 
     Raises
     ------
@@ -176,7 +156,7 @@ class LegacyConvention:
 
     Parameters
     ----------
-    way
+    frame_order
         ``"yx"``, ``"xy"`` or ``"as_is"``.
     pyramid
         Whether the sensor is a pyramid.
@@ -218,14 +198,9 @@ class LegacyConvention:
         return reordered + np.float32(0.5) if off else reordered
 
     def matrix(self, matrix: NDArray[Any], old_valid: NDArray[np.bool_]) -> NDArray[Any]:
-        """An interaction matrix ``(n_slopes, n_modes)`` with its rows in the order of 2.x.
+        """An interaction matrix of 1.x ``(n_slopes, n_modes)`` with its rows in the order of 2.x.
 
-        Parameters
-        ----------
-        matrix
-            As 1.x had it.
-        old_valid
-            The mask it was made with, as 1.x had it.
+        ``old_valid`` is the mask it was made with, as 1.x had it.
         """
         numbers = np.full(old_valid.shape, -1)
         numbers[tuple(slope_positions(old_valid, self.pyramid))] = np.arange(int(old_valid.sum()))
@@ -233,21 +208,14 @@ class LegacyConvention:
         return np.asarray(matrix[reordered[tuple(slope_positions(reordered >= 0, self.pyramid))]])
 
 
-def require_frame_order(file: PyrtcFile, frame_order: str | None) -> str:
-    """How a file of pyRTC 1.x was made, as stated.
-
-    Raises
-    ------
-    IncompatibleProduct
-        The description is missing.
-    """
+def require_frame_order(file: PyrtcFile, frame_order: str | None) -> None:
+    """Refuse a file of pyRTC 1.x without the orientation of its frames (:class:`IncompatibleProduct`)."""
     if frame_order is None:
         raise IncompatibleProduct(
             f"{file.path}: a file of pyRTC 1.x without the orientation of its frames; give it with "
             "--legacy yx (frames as the camera gave them), xy (transposed by pyRTC's camera adapter) or "
             "as_is (already as 2.x has it)"
         )
-    return frame_order
 
 
 def slope_positions(valid: NDArray[np.bool_], pyramid: bool) -> NDArray[np.intp]:

@@ -70,14 +70,7 @@ class PyrtcLenslets:
 
     @classmethod
     def from_grid(cls, grid: SubApertureGrid, shape: tuple[int, int]) -> PyrtcLenslets:
-        """The windows that come nearest to a grid.
-
-        Parameters
-        ----------
-        grid
-            Our grid.
-        shape
-            Frame (rows, columns).
+        """The windows that come nearest to our grid on a frame (rows, columns).
 
         Raises
         ------
@@ -88,9 +81,8 @@ class PyrtcLenslets:
         windows = cls(grid.pitch_px, 0, 0, shape)
         if max(rows.max(initial=0), columns.max(initial=0)) >= windows.n:
             raise IncompatibleProduct(
-                f"pyRTC reads {windows.n} x {windows.n} sub-apertures of {windows.window} pixels "
-                f"on a frame of "
-                f"{shape[1]} x {shape[0]}; valid ones lie beyond"
+                f"pyRTC reads {windows.n} x {windows.n} sub-apertures of {windows.window} pixels on a frame "
+                f"of {shape[1]} x {shape[0]}; valid ones lie beyond"
             )
         at_x, at_y = windows.centres()
         wanted = grid.centres_px()
@@ -131,10 +123,8 @@ class PyrtcLenslets:
 
         Parameters
         ----------
-        mask
-            Valid sub-apertures ``(2 n, n)``.
-        references
-            Reference slopes ``(2 n, n)``, pixels.
+        mask, references
+            Valid sub-apertures and reference slopes ``(2 n, n)``, pixels.
         n_sub
             Sub-apertures across the pupil by our design; the grid is so large.
 
@@ -169,9 +159,8 @@ class PyrtcLenslets:
         own = (spots - bare.centres_px()).astype(np.float32)
         grid = SubApertureGrid(self.spacing, origin, valid, own, flux)
         note = (
-            "the mask does not determine on which side of the pupil a row of dark sub-apertures "
-            "is; shifts of "
-            "the registration may be off by half a sub-aperture"
+            "the mask does not determine on which side of the pupil a row of dark sub-apertures is; shifts "
+            "of the registration may be off by half a sub-aperture"
         )
         return grid, np.arange(2 * len(rows)), note if ambiguous else None
 

@@ -6,11 +6,8 @@ import itertools
 import logging
 import os
 import time
-from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 import zmq
@@ -32,11 +29,10 @@ from escape_hw.remote.address import (
     unregister_server,
 )
 from escape_hw.remote.keys import allowed_keys, server_keys
-from escape_hw.remote.source import STREAMS
+from escape_hw.remote.source import RENAMED_STREAMS, STREAMS
 from escape_hw.remote.state import SCHEMA, FinishedRun, LogLine, Phase, State
-from escape_hw.server.frontend.engine_supervisor import EngineSupervisor
-from escape_hw.server.frontend.lease import LeaseManager, RegisteredClient
-from escape_hw.server.frontend.published_state import PublishedState
+from escape_hw.server.frontend.engine_supervisor import EngineSupervisor, PublishedState
+from escape_hw.server.frontend.lease import LeaseManager
 from escape_hw.server.frontend.transport import IncomingRequest, ZmqTransport
 from escape_hw.server.ipc.channel import EngineSetup
 from escape_hw.server.ipc.log import ServerLog
@@ -44,43 +40,9 @@ from escape_hw.server.safety.journal import ServerJournal
 from escape_hw.streams.ring import ReaderCache
 from escape_hw.supervision import process_start
 
-
-class StreamSampler:
-    """Reads the newest entries of the engine's streams, for clients on other computers."""
-
-    def __init__(self) -> None:
-        self._readers = ReaderCache()
-
-    def latest(
-        self, stream: str, segment: str | None, after: int
-    ) -> tuple[dict[str, Any] | None, bytes | None]:
-        """Header and bytes of a stream's newest entry; ``None`` when there is none newer than ``after``."""
-        reader = self._readers.reader(stream, segment)
-        sample = None if reader is None else reader.latest(after)
-        if sample is None:
-            return None, None
-        head = {
-            "index": sample.index, "exposed_ns": sample.exposed_ns, "arrived_ns": sample.arrived_ns,
-            "dtype": sample.data.dtype.str, "shape": list(sample.data.shape), "meta": dict(sample.meta),
-        }  # fmt: skip
-        return head, sample.data.tobytes()
-
-    def close(self) -> None:
-        """Close the streams."""
-        self._readers.close()
-
-
 log = logging.getLogger(__name__)
 
 _POLL_MS = 50
-
-
-@dataclass(frozen=True, slots=True)
-class PendingRequest:
-    """A request that the engine has not answered yet, and when it was forwarded (monotonic seconds)."""
-
-    incoming: IncomingRequest
-    since_s: float
 
 
 class FrontEnd:
@@ -101,24 +63,16 @@ class FrontEnd:
             notes=self._journal.read_previous_end(),
         )  # fmt: skip
         self._published = PublishedState(state, self._leases, transport)
-        self._pending: dict[int, PendingRequest] = {}
+        #: Requests that the engine has not answered yet, and when they were forwarded (monotonic seconds).
+        self._pending: dict[int, tuple[IncomingRequest, float]] = {}
         self._numbers = itertools.count(1)
-        self._sampler = StreamSampler()
+        self._readers = ReaderCache()
         self._journal.write(None)
         setup = EngineSetup(config_text=config.to_toml(), runs=runs, read_folders=read_folders)
         self._supervisor = EngineSupervisor(
             config.server, setup, self._journal, self._published,
             on_message=self._on_engine_message, on_exit=self._refuse_pending,
         )  # fmt: skip
-        self._handlers: dict[type[requests.Request], Callable[[Any, RegisteredClient], object]] = {
-            requests.GetState: lambda request, client: self._published.state,
-            requests.GetLog: lambda request, client: [
-                line.model_dump(mode="json") for line in self._log.after(request.after, request.count)
-            ],
-            requests.ClientHeartbeat: lambda request, client: None,
-            requests.AcquireLease: self._acquire,
-            requests.ReleaseLease: self._release,
-        }
 
     # ------------------------------------------------------------ life
     def run(self, stop: StopSignal) -> None:
@@ -154,13 +108,13 @@ class FrontEnd:
         )
         if clean:
             self._journal.close()
-        self._sampler.close()
+        self._readers.close()
         self._log.close()
 
     def _oldest_safety_request_s(self) -> float:
         waiting = [
-            one.since_s for one in self._pending.values()
-            if isinstance(one.incoming.request, requests.SAFETY_REQUESTS)
+            since_s for incoming, since_s in self._pending.values()
+            if incoming.request.verb in requests.SAFETY_VERBS
         ]  # fmt: skip
         return time.monotonic() - min(waiting) if waiting else 0.0
 
@@ -185,9 +139,9 @@ class FrontEnd:
                 if pending is None:
                     return
                 if "error" in message:
-                    self._transport.send_error(pending.incoming.route, message["error"])
+                    self._transport.send_error(pending[0].route, message["error"])
                 else:
-                    self._transport.send_reply(pending.incoming.route, message["answer"])
+                    self._transport.send_reply(pending[0].route, message["answer"])
             case {"log": line}:
                 self._log.add(LogLine.model_validate(line))
             case {"progress": progress}:
@@ -196,33 +150,47 @@ class FrontEnd:
                 self._transport.publish("ended", FinishedRun.model_validate(ended))
 
     def _refuse_pending(self) -> None:
-        for pending in self._pending.values():
-            self._transport.send_error(pending.incoming.route, RequestRefused("the engine has ended"))
+        for incoming, _ in self._pending.values():
+            self._transport.send_error(incoming.route, RequestRefused("the engine has ended"))
         self._pending.clear()
 
     # ------------------------------------------------------------ requests of the clients
     def _handle_request(self, incoming: IncomingRequest) -> None:
-        request = incoming.request
+        request, route = incoming.request, incoming.route
         try:
             if isinstance(request, requests.RegisterClient):
-                self._transport.send_reply(incoming.route, self._register(request, incoming.route.sender))
+                self._transport.send_reply(route, self._register(request, route.sender))
                 return
-            client = self._leases.record_activity(request.client, incoming.route.sender)
-            if isinstance(request, requests.LEASE_REQUESTS):
+            client = self._leases.record_activity(request.client, route.sender)
+            if request.verb in requests.LEASE_VERBS:
                 self._leases.require(client)
-            if isinstance(request, requests.SAFETY_REQUESTS):
+            if request.verb in requests.SAFETY_VERBS:
                 log.warning("%s: %s", client.description, request.verb.replace("_", " "))
-            if isinstance(request, requests.GetLatestSample):
-                self._send_latest(request, incoming)
-            elif type(request) in self._handlers:
-                self._transport.send_reply(incoming.route, self._handlers[type(request)](request, client))
-            else:
-                self._forward(incoming)
+            match request:
+                case requests.GetLatestSample():
+                    self._transport.send_reply(route, *self._latest(request))
+                case requests.GetLog():
+                    lines = self._log.after(request.after, request.count)
+                    self._transport.send_reply(route, [line.model_dump(mode="json") for line in lines])
+                case requests.AcquireLease():
+                    lease = self._leases.acquire(client, request.take_over)
+                    self._published.update()
+                    self._transport.send_reply(route, lease)
+                case requests.PlainRequest(verb="release_lease"):
+                    self._leases.release(client)
+                    self._published.update()
+                    self._transport.send_reply(route, None)
+                case requests.PlainRequest(verb="state"):
+                    self._transport.send_reply(route, self._published.state)
+                case requests.PlainRequest(verb="heartbeat"):
+                    self._transport.send_reply(route, None)
+                case _:
+                    self._forward(incoming)
         except EscapeError as error:
-            self._transport.refuse(incoming.route, error)
+            self._transport.refuse(route, error)
         except Exception as error:
             log.exception("unexpected exception at '%s'", request.verb)
-            self._transport.send_error(incoming.route, error)
+            self._transport.send_error(route, error)
 
     def _register(self, registration: requests.RegisterClient, route: bytes) -> State:
         if registration.schema_version != SCHEMA:
@@ -233,21 +201,21 @@ class FrontEnd:
         self._leases.register_client(registration, route)
         return self._published.state
 
-    def _acquire(self, request: requests.AcquireLease, client: RegisteredClient) -> object:
-        lease = self._leases.acquire(client, request.take_over)
-        self._published.update()
-        return lease
-
-    def _release(self, request: requests.ReleaseLease, client: RegisteredClient) -> None:
-        self._leases.release(client)
-        self._published.update()
-
-    def _send_latest(self, request: requests.GetLatestSample, incoming: IncomingRequest) -> None:
-        if request.stream not in STREAMS:
-            raise RequestRefused(f"there is no stream '{request.stream}'; there are {', '.join(STREAMS)}")
-        segment = {one.name: one.segment for one in self._published.state.streams}.get(request.stream)
-        head, data = self._sampler.latest(request.stream, segment, request.after)
-        self._transport.send_reply(incoming.route, head, data)
+    def _latest(self, request: requests.GetLatestSample) -> tuple[dict[str, Any] | None, bytes | None]:
+        """Header and bytes of a stream's newest entry; ``None`` when there is none newer."""
+        stream = RENAMED_STREAMS.get(request.stream, request.stream)
+        if stream not in STREAMS:
+            raise RequestRefused(f"there is no stream '{stream}'; there are {', '.join(STREAMS)}")
+        segment = {one.name: one.segment for one in self._published.state.streams}.get(stream)
+        reader = self._readers.reader(stream, segment)
+        sample = None if reader is None else reader.latest(request.after)
+        if sample is None:
+            return None, None
+        head = {
+            "index": sample.index, "exposed_ns": sample.exposed_ns, "arrived_ns": sample.arrived_ns,
+            "dtype": sample.data.dtype.str, "shape": list(sample.data.shape), "meta": dict(sample.meta),
+        }  # fmt: skip
+        return head, sample.data.tobytes()
 
     def _forward(self, incoming: IncomingRequest) -> None:
         """Forward a request to the engine."""
@@ -255,27 +223,27 @@ class FrontEnd:
         if engine is None:
             self._handle_without_engine(incoming)
             return
-        if isinstance(incoming.request, requests.Shutdown):
+        if incoming.request.verb == "shutdown":
             self._supervisor.note_stop_request()
         number = next(self._numbers)
-        self._pending[number] = PendingRequest(incoming, time.monotonic())
+        self._pending[number] = (incoming, time.monotonic())
         engine.send({"id": number, "request": incoming.request.model_dump(mode="json")})
 
     def _handle_without_engine(self, incoming: IncomingRequest) -> None:
         """Answer a request while there is no engine; the fail-safe process has made the mirror safe."""
-        request, supervisor = incoming.request, self._supervisor
-        if isinstance(request, requests.Shutdown):
+        verb, supervisor = incoming.request.verb, self._supervisor
+        if verb == "shutdown":
             supervisor.stopping = True
         elif not supervisor.has_ended:
             raise RequestRefused(
                 "the engine has died; the fail-safe process makes the mirror safe; try again"
             )
-        elif isinstance(request, requests.ClearFault):
+        elif verb == "clear_fault":
             self._published.state = self._published.state.model_copy(
                 update={"fault": None, "phase": Phase.STARTING}
             )
             supervisor.start()
-        elif not isinstance(request, requests.SAFETY_REQUESTS):
+        elif verb not in requests.SAFETY_VERBS:
             raise RequestRefused("the engine has died; clear the fault to start it again")
         self._transport.send_reply(incoming.route, None)
 
@@ -295,17 +263,8 @@ class ClientKeyCheck:
 class Server:
     """A listening server with its sockets and its entry in the user's list; a context manager.
 
-    Parameters
-    ----------
-    config
-        The system.
-    host, port
-        TCP address to listen on in addition to the local sockets; none without a port.
-
-    Raises
-    ------
-    ConfigError
-        The system is served already, or the address is not available.
+    It listens on local sockets and, with a ``port``, on TCP as well. ConfigError: the system is served
+    already, or the address is not available.
     """
 
     def __init__(self, config: SystemConfig, host: str = "127.0.0.1", port: int | None = None) -> None:
@@ -352,7 +311,5 @@ class Server:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._stack.close()

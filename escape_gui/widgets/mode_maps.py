@@ -1,21 +1,174 @@
-"""Interactive mosaic of mode maps: one image, a number above each mode, hover and click."""
+"""Mosaic of mode maps, grid of slope maps with titles, and their colour scale."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import pyqtgraph as pg
 from numpy.typing import NDArray
-from PySide6.QtCore import QPointF, Qt, Signal
-from PySide6.QtGui import QFontMetricsF, QKeyEvent, QResizeEvent
-from PySide6.QtWidgets import QWidget
+from PySide6.QtCore import QPointF, QRect, QSize, Qt, Signal
+from PySide6.QtGui import QFontMetricsF, QImage, QKeyEvent, QPainter, QPaintEvent, QResizeEvent
+from PySide6.QtWidgets import QGridLayout, QLabel, QSizePolicy, QWidget
 
 from escape_gui.theme import Theme
-from escape_gui.views import mode_mosaic
-from escape_gui.views.mode_mosaic import ModeStatistics, MosaicLayout
-from escape_gui.widgets.images.colour_scale import DIVERGING, lookup_table
-from escape_gui.widgets.layouts import column
+from escape_gui.views import mode_maps as mode_views
+from escape_gui.views.mode_maps import MapTile, ModeStatistics, MosaicLayout, colour_indices
+from escape_gui.widgets.controls import column
+from escape_gui.widgets.plots import reparent_menu, style_axis
+
+#: Colour maps for signed values and for magnitudes, suitable for any colour vision.
+DIVERGING, SEQUENTIAL = "CET-D1A", "cividis"
+
+
+@lru_cache(maxsize=8)
+def lookup_table(name: str) -> NDArray[np.uint8]:
+    """A colour map for indices ``(256, 4)``: 0 is transparent, 1 to 255 span the map."""
+    colours = np.zeros((256, 4), np.uint8)
+    colours[1:] = pg.colormap.get(name).getLookupTable(0.0, 1.0, 255, alpha=True)
+    return colours
+
+
+class ColourScale(QWidget):
+    """A vertical colour scale with numbers and a label."""
+
+    def __init__(self, theme: Theme, name: str) -> None:
+        super().__init__()
+        self._theme = theme
+        self._plot = pg.PlotWidget()
+        reparent_menu(self._plot.getPlotItem())
+        self._plot.setMouseEnabled(x=False, y=False)
+        self._plot.hideButtons()
+        self._plot.showAxis("right")
+        for side in ("left", "bottom"):
+            self._plot.hideAxis(side)
+        self._image = pg.ImageItem(np.arange(1, 256, dtype=np.uint8)[:, None], axisOrder="row-major")
+        self._image.setLevels((0, 255))
+        self._plot.addItem(self._image)
+        column(self._plot, parent=self)
+        self._label = ""
+        self._image.setLookupTable(lookup_table(name))
+        theme.follow(self.apply_theme)
+
+    def set_range(self, low: float, high: float, label: str) -> None:
+        self._image.setRect(0, low, 1, high - low)
+        self._plot.setRange(xRange=(0, 1), yRange=(low, high), padding=0.025)
+        self._label = label
+        self.apply_theme()
+
+    def apply_theme(self) -> None:
+        self._plot.setBackground(self._theme.colour("panel"))
+        style_axis(self._theme, self._plot.getAxis("right"), self._label)
+        self.setFixedWidth(self._theme.pixels(64))
+
+
+#: Height of a line of a title at font scale 1, pixels.
+_LINE = 14
+
+
+def best_columns(count: int, width: float, height: float, title: float) -> int:
+    """Number of columns for which ``count`` images with an aspect ratio of 2 : 1 are largest.
+
+    ``width`` and ``height`` are those of the grid, ``title`` is the height above each image, in pixels.
+    """
+
+    def size(columns: int) -> float:
+        rows = -(-max(count, 1) // columns)
+        return min(width / columns / 2, height / rows - title)
+
+    return max(range(1, max(count, 1) + 1), key=size)
+
+
+class MapImage(QWidget):
+    """An image with square pixels, as large as the widget permits."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._pixels: NDArray[np.uint8] = np.zeros((0, 0, 4), np.uint8)
+        self.setSizePolicy(QSizePolicy.Policy.Ignored, QSizePolicy.Policy.Expanding)
+        self.setMinimumHeight(32)
+
+    def show_tile(self, tile: MapTile) -> None:
+        low, high = tile.limits
+        centred = tile.maps - (low + high) / 2
+        colours = lookup_table(DIVERGING if tile.signed else SEQUENTIAL)
+        self._pixels = np.ascontiguousarray(colours[colour_indices(centred, (high - low) / 2)])
+        self.update()
+
+    def sizeHint(self) -> QSize:
+        rows, columns = self._pixels.shape[:2]
+        return QSize(columns, rows)
+
+    def paintEvent(self, event: QPaintEvent) -> None:
+        rows, columns = self._pixels.shape[:2]
+        if not rows:
+            return
+        image = QImage(self._pixels.data, columns, rows, 4 * columns, QImage.Format.Format_RGBA8888)
+        size = QSize(columns, rows).scaled(self.size(), Qt.AspectRatioMode.KeepAspectRatio)
+        corner = QRect(0, 0, size.width(), size.height())
+        corner.moveCenter(self.rect().center())
+        QPainter(self).drawImage(corner, image)
+
+
+class MapTiles(QWidget):
+    """Tiles of one mode in a grid."""
+
+    def __init__(self, theme: Theme) -> None:
+        super().__init__()
+        self._theme, self._columns = theme, 2
+        self.tiles: tuple[MapTile, ...] = ()
+        self._tile_widgets: list[tuple[QWidget, QLabel, MapImage]] = []
+        self._grid = QGridLayout(self)
+        self._grid.setContentsMargins(4, 4, 4, 4)
+        self._grid.setSpacing(8)
+        theme.changed.connect(self.apply_theme)
+
+    def resizeEvent(self, event: QResizeEvent) -> None:
+        super().resizeEvent(event)
+        self._arrange()
+
+    def _arrange(self) -> None:
+        title = 4 * self._theme.pixels(_LINE)
+        columns = best_columns(len(self.tiles), self.width(), self.height(), title)
+        if columns != self._columns:
+            self._columns = columns
+            for number, (holder, _, _) in enumerate(self._tile_widgets):
+                self._grid.addWidget(holder, *divmod(number, columns))
+
+    def show_tiles(self, tiles: Sequence[MapTile]) -> None:
+        self.tiles = tuple(tiles)
+        while len(self._tile_widgets) < len(self.tiles):
+            self._add_tile_widget()
+        for number, (holder, title, image) in enumerate(self._tile_widgets):
+            holder.setVisible(number < len(self.tiles))
+            if number < len(self.tiles):
+                title.setText(self._title(self.tiles[number]))
+                image.show_tile(self.tiles[number])
+        self._arrange()
+
+    def _add_tile_widget(self) -> None:
+        holder, title, image = QWidget(), QLabel(), MapImage()
+        title.setWordWrap(True)
+        title.setFont(self._theme.font(0.9))
+        # Titles wrap, so that all columns have the same width.
+        title.setSizePolicy(QSizePolicy.Policy.Ignored, QSizePolicy.Policy.Minimum)
+        column(title, (image, 1), parent=holder, spacing=2)
+        self._grid.addWidget(holder, *divmod(len(self._tile_widgets), self._columns))
+        self._tile_widgets.append((holder, title, image))
+
+    def _title(self, tile: MapTile) -> str:
+        low, high = tile.limits
+        scale = f"±{high:g}" if tile.signed else f"{low:g} to {high:g}"
+        muted = self._theme.colours.muted
+        return f"<b>{tile.title}</b><br><span style='color:{muted}'>{tile.note}<br>colours {scale}</span>"
+
+    def apply_theme(self) -> None:
+        for _, title, _ in self._tile_widgets:
+            title.setFont(self._theme.font(0.9))
+        self.show_tiles(self.tiles)
+
 
 #: Minimum width of a mode's pair of maps at font scale 1, pixels.
 _MIN_MODE_WIDTH = 104
@@ -59,8 +212,7 @@ class ModeMosaic(QWidget):
         #: The selected mode, from 0; -1 if none.
         self.mode = -1
         self._build_view()
-        theme.changed.connect(self.apply_theme)
-        self.apply_theme()
+        theme.follow(self.apply_theme)
 
     def _build_view(self) -> None:
         self._view = pg.GraphicsView()
@@ -86,7 +238,7 @@ class ModeMosaic(QWidget):
     @property
     def page(self) -> tuple[int, int]:
         """Page, from 0, and number of pages."""
-        return self._page, mode_mosaic.pages(self._layout, self.n_modes)
+        return self._page, mode_views.pages(self._layout, self.n_modes)
 
     def show_matrix(
         self,
@@ -129,7 +281,7 @@ class ModeMosaic(QWidget):
     def _arrange(self) -> None:
         """Compute the layout for the size of the widget."""
         rows, columns = self._valid.shape
-        self._layout = mode_mosaic.fit_layout(
+        self._layout = mode_views.fit_layout(
             (rows, columns),
             max(1, self.n_modes),
             (float(self.width()), float(self.height())),
@@ -146,9 +298,9 @@ class ModeMosaic(QWidget):
         if not self.n_modes:
             self._image.clear()
             return
-        modes = mode_mosaic.page_modes(self._layout, self.n_modes, self._page)
-        values = mode_mosaic.normalise_modes(self._data, self._statistics, self._weight_by_snr)
-        image = mode_mosaic.render_page(self._layout, self._valid, values, modes)
+        modes = mode_views.page_modes(self._layout, self.n_modes, self._page)
+        values = mode_views.normalise_modes(self._data, self._statistics, self._weight_by_snr)
+        image = mode_views.render_page(self._layout, self._valid, values, modes)
         self._image.setImage(image, autoLevels=False, levels=(0, 255))
         if labels:
             self._place_numbers(modes)

@@ -5,41 +5,19 @@ Gaps in the index remove pairs; ``docrime.estimator`` and ``sprint.telemetry_fit
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import isfinite
 
 import numpy as np
 from numpy.typing import NDArray
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class AlignedTelemetry:
-    """A stretch of a run, one row per frame index, lost frames included.
-
-    Parameters
-    ----------
-    rows
-        ``(n_times, n_slopes + n_modes)``: the slopes, and the command that was sent after the frame of that
-        row. Slopes of lost frames are zero; while a frame is lost, the previous command stays on the mirror.
-        Side by side, one pass filters both. In closed loop, where a command is the sum of the controller's
-        command and a poke, the poke follows: ``(n_times, n_slopes + 2 n_modes)``.
-    present
-        ``(n_times,)``, false where the frame was lost.
-    n_slopes
-        Number of columns with slopes.
-    closed
-        Whether the rows are of a closed loop.
-    """
+class TelemetryRows:
+    """Slopes and commands side by side, and in closed loop the pokes; one row per frame."""
 
     rows: NDArray[np.float32]
-    present: NDArray[np.bool_]
     n_slopes: int
-    closed: bool = False
-
-    @property
-    def slopes(self) -> NDArray[np.float32]:
-        """``(n_times, n_slopes)``."""
-        return self.rows[:, : self.n_slopes]
+    closed: bool
 
     @property
     def n_modes(self) -> int:
@@ -55,6 +33,32 @@ class AlignedTelemetry:
     def pokes(self) -> NDArray[np.float32]:
         """``(n_times, n_modes)``; in open loop these are the commands."""
         return self.rows[:, self.rows.shape[1] - self.n_modes :]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AlignedTelemetry(TelemetryRows):
+    """A stretch of a run, one row per frame index, lost frames included.
+
+    Parameters
+    ----------
+    rows
+        ``(n_times, n_slopes + n_modes)``: the slopes, and the command that was sent after the frame of that
+        row. Slopes of lost frames are zero; while a frame is lost, the previous command stays on the mirror.
+        Side by side, one pass filters both. In closed loop, where a command is the sum of the controller's
+        command and a poke, the poke follows: ``(n_times, n_slopes + 2 n_modes)``.
+    present
+        ``(n_times,)``, false where the frame was lost.
+    """
+
+    rows: NDArray[np.float32]
+    present: NDArray[np.bool_]
+    n_slopes: int
+    closed: bool = False
+
+    @property
+    def slopes(self) -> NDArray[np.float32]:
+        """``(n_times, n_slopes)``."""
+        return self.rows[:, : self.n_slopes]
 
     def find_complete_rows(self, past: int, lags: int) -> NDArray[np.intp]:
         """Rows with ``past`` present slopes before them, and with known commands of ``past + lags`` rows."""
@@ -76,17 +80,7 @@ class AlignedTelemetry:
 
 
 class AlignedBuffer:
-    """Preallocated rows of :class:`AlignedTelemetry` that are filled, processed and reused.
-
-    Parameters
-    ----------
-    n_slopes, n_modes
-        Number of slopes and of modes.
-    rows
-        Rows of the buffer.
-    closed
-        Whether frames are of a closed loop, with the poke beside the command.
-    """
+    """Preallocated rows of :class:`AlignedTelemetry` that are filled, processed and reused."""
 
     def __init__(self, n_slopes: int, n_modes: int, rows: int, *, closed: bool = False) -> None:
         self.n_slopes, self.closed = n_slopes, closed
@@ -124,10 +118,7 @@ class AlignedBuffer:
     def append_one(self, slopes: NDArray[np.floating], excitation: NDArray[np.floating]) -> int:
         """Append one frame; the buffer must not be full.
 
-        Returns
-        -------
-        int
-            Remaining room in frames; -1 if the frame is not finite, in which case it is not appended.
+        Returns the remaining room in frames; -1 if the frame is not finite, in which case it is not appended.
         """
         if not self._row_views:
             rows = self._rows
@@ -188,14 +179,8 @@ class AlignedBuffer:
 class TelemetryBuffer:
     """Collects the telemetry of a running loop in blocks; an observer of the loop.
 
-    Parameters
-    ----------
-    n_slopes, n_modes
-        Number of slopes and of modes.
-    rows
-        Frames of a block.
-    history_rows
-        Rows that each block repeats of the previous one: the past of its first frames.
+    ``rows``: frames of a block; ``history_rows``: rows that each block repeats of the previous one: the past
+    of its first frames.
 
     Attributes
     ----------
@@ -239,6 +224,6 @@ class TelemetryBuffer:
     def take_block(self) -> tuple[AlignedTelemetry, int]:
         """A copy of the rows collected, and how many rows at its start an earlier block contained."""
         data, start = self._buffer.telemetry(), self._buffer.n_retained
-        block = AlignedTelemetry(data.rows.copy(), data.present.copy(), data.n_slopes, data.closed)
+        block = replace(data, rows=data.rows.copy(), present=data.present.copy())
         self._buffer.retain_last(self._history_rows)
         return block, start

@@ -1,4 +1,4 @@
-"""The form of a procedure's arguments, made of what the server says of them."""
+"""Form for the arguments of a procedure, built from its description by the server."""
 
 from __future__ import annotations
 
@@ -9,49 +9,40 @@ from PySide6.QtWidgets import (
     QCheckBox,
     QComboBox,
     QFormLayout,
-    QFrame,
-    QHBoxLayout,
     QLabel,
     QLineEdit,
-    QScrollArea,
     QSizePolicy,
-    QVBoxLayout,
     QWidget,
 )
 
-from escape_gui.theme import Theme
 from escape_gui.views import procedure_form as form_text
+from escape_gui.widgets.controls import caption, column, row, scroll_area
 from escape_hw.remote.state import Arguments, ProcedureParameter
 
 
 class ArgumentForm(QWidget):
-    """One row for each argument; what may be left out stands empty."""
+    """One row for each argument; optional arguments may be empty."""
 
-    #: Anything was edited.
+    #: A value was changed.
     edited = Signal()
 
-    def __init__(self, theme: Theme) -> None:
+    def __init__(self) -> None:
         super().__init__()
-        self._theme = theme
         self._parameters: tuple[ProcedureParameter, ...] = ()
         self.fields: dict[str, QWidget] = {}
         self._matrices: tuple[str, ...] = ()
-        self._area = QScrollArea()
-        self._area.setWidgetResizable(True)
-        self._area.setFrameShape(QFrame.Shape.NoFrame)
+        self._area = scroll_area()
         self._area.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
-        layout = QVBoxLayout(self)
-        layout.setContentsMargins(0, 0, 0, 0)
-        layout.addWidget(self._area)
-        # What follows stands right below the last argument; on a small screen the form scrolls.
+        column(self._area, parent=self)
+        # The next widget is directly below the last argument; on a small screen the form scrolls.
         self.setSizePolicy(QSizePolicy.Policy.Preferred, QSizePolicy.Policy.Maximum)
 
     def sizeHint(self) -> QSize:
-        parameter_hint, page = super().sizeHint(), self._area.widget()
-        return parameter_hint if page is None else QSize(parameter_hint.width(), page.sizeHint().height())
+        hint, page = super().sizeHint(), self._area.widget()
+        return hint if page is None else QSize(hint.width(), page.sizeHint().height())
 
     def show_parameters(self, parameters: Sequence[ProcedureParameter], matrices: tuple[str, ...]) -> None:
-        """Make the form; arguments stand at their defaults."""
+        """Build the form, with the default values."""
         self._parameters, self._matrices = tuple(parameters), matrices
         self.fields = {}
         page = QWidget()
@@ -66,22 +57,15 @@ class ArgumentForm(QWidget):
             field.setAccessibleName(form_text.label(one))
             field.setAccessibleDescription(form_text.parameter_hint(one))
             self.fields[one.name] = field
-            row = QHBoxLayout()
-            row.setSpacing(8)
-            row.addWidget(field, 1)
-            if one.unit:
-                unit = QLabel(one.unit)
-                unit.setObjectName("caption")
-                row.addWidget(unit)
             name = QLabel(form_text.label(one))
             name.setToolTip(form_text.parameter_hint(one))
             name.setBuddy(field)
-            form.addRow(name, row)
+            form.addRow(name, row((field, 1), *([caption(one.unit)] if one.unit else [])))
         self._area.setWidget(page)
         self.updateGeometry()
 
     def set_matrix_choices(self, matrices: tuple[str, ...]) -> None:
-        """Other matrices to choose from; a choice that is still there stays."""
+        """Replace the matrices to choose from; a choice that still exists is kept."""
         if matrices == self._matrices:
             return
         self._matrices = matrices
@@ -123,25 +107,8 @@ class ArgumentForm(QWidget):
         line.textEdited.connect(self.edited)
         return line
 
-    def set_value(self, name: str, text: str) -> None:
-        """Put a value into a field, as somebody would who types it."""
-        field = self.fields[name]
-        if isinstance(field, QLineEdit):
-            field.setText(text)
-        elif isinstance(field, QComboBox):
-            field.setCurrentText(text)
-        elif isinstance(field, QCheckBox):
-            field.setChecked(text == "True")
-        self.edited.emit()
-
     def arguments(self) -> Arguments:
-        """What stands in the form; arguments at their defaults are left out.
-
-        Raises
-        ------
-        ValueError
-            A field holds what cannot be meant; says which and what would do.
-        """
+        """Values that differ from their defaults (ValueError: invalid field; gives the allowed values)."""
         values: Arguments = {}
         for one in self._parameters:
             field = self.fields[one.name]

@@ -1,4 +1,4 @@
-"""Live image with display range, cursor, logarithmic scale and marked pixels, and its tool bar."""
+"""Live image with cursor, marks and tool bar; slopes as arrows over it."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ from PySide6.QtGui import QKeyEvent
 from PySide6.QtWidgets import QLabel, QSizePolicy, QWidget
 
 from escape_gui.theme import Theme
-from escape_gui.widgets.layouts import column, flat_button, row
+from escape_gui.widgets.controls import column, flat_button, row
+from escape_hw.remote.state import Geometry
 
 #: Colour maps for counts and magnitudes, with monotonic lightness, suitable for any colour vision.
 SEQUENTIAL_MAPS = ("CET-L1", "inferno", "cividis", "CET-CBL1")
@@ -32,14 +33,8 @@ _CURSOR_STEPS = {
 class ImageViewer(QWidget):
     """Shows an array with square pixels and the first row at the top.
 
-    Parameters
-    ----------
-    maps
-        Names of the colour maps that the key M cycles through.
-    symmetric
-        Display range symmetric about zero.
-    min_level
-        Minimum of the upper level of a symmetric display range.
+    The key M cycles through the colour maps ``maps``. A ``symmetric`` display range is symmetric about zero,
+    its upper level at least ``min_level``.
     """
 
     #: Position and value under the cursor, as text.
@@ -86,8 +81,7 @@ class ImageViewer(QWidget):
         self.setMinimumSize(96, 96)
         self.view.scene().sigMouseMoved.connect(self._on_mouse_moved)
         self.view.scene().sigMouseClicked.connect(lambda _: self.setFocus())
-        theme.changed.connect(self._apply_theme)
-        self._apply_theme()
+        theme.follow(self._apply_theme)
         self.image.setColorMap(pg.colormap.get(self._maps[0]))
 
     # ------------------------------------------------------------ data
@@ -185,7 +179,7 @@ class ImageViewer(QWidget):
         self.cursor_changed.emit(f"x {x:4d}  y {y:4d}  {text:>8} {self.unit}".rstrip())
 
     def keyPressEvent(self, event: QKeyEvent) -> None:
-        """Keys of :data:`escape_gui.window.help_pages.IMAGE_KEYS`."""
+        """Keys of :data:`escape_gui.window.actions.IMAGE_KEYS`."""
         key = Qt.Key(event.key())
         if key in _CURSOR_STEPS and self.data is not None:
             rows, columns = self.data.shape
@@ -238,8 +232,60 @@ class ImageToolbar(QWidget):
         buttons.append(flat_button("Lock scale", "Lock the display range", checkable=True))
         buttons[-1].toggled.connect(lambda on: image_view.set_automatic(not on))
         row((self.cursor_value, 1), *buttons, parent=self, spacing=2)
-        theme.changed.connect(self._apply_theme)
-        self._apply_theme()
+        theme.follow(self._apply_theme)
 
     def _apply_theme(self) -> None:
         self.cursor_value.setFont(self._theme.font(0.9, mono=True))
+
+
+#: Up to this number, outlines are the circular pupils of a pyramid sensor.
+_MAX_PUPILS = 8
+#: Length of the arrow of a slope of one pixel, in half widths of a sub-aperture.
+_ARROW_SCALE = 0.8
+
+
+class Quiver(pg.PlotCurveItem):  # type: ignore[misc]
+    """Arrows that start at the centres of the sub-apertures."""
+
+    def __init__(self, theme: Theme) -> None:
+        super().__init__()
+        self._theme = theme
+        self._x = self._y = np.zeros(0)
+        self._length = 1.0
+        self.setZValue(4)
+        self.setVisible(False)
+        theme.follow(self.apply_theme)
+
+    def set_geometry(self, geometry: Geometry) -> None:
+        outlines = np.asarray(geometry.outlines_px, float).reshape(-1, 3)
+        self._x, self._y = outlines[:, 0], outlines[:, 1]
+        self._length = _ARROW_SCALE * float(outlines[:, 2].mean()) if len(outlines) else 1.0
+        self.setData([], [])
+
+    def show_slopes(self, slopes: NDArray[np.floating]) -> None:
+        """Show slopes ``(2 * n,)`` in pixels, all x, then all y; nothing if their number does not match."""
+        n = self._x.size
+        if slopes.size != 2 * n or n == 0:
+            self.setData([], [])
+            return
+        x, y = np.repeat(self._x, 2), np.repeat(self._y, 2)
+        x[1::2] += self._length * slopes[:n]
+        y[1::2] += self._length * slopes[n:]
+        self.setData(x, y, connect="pairs")
+
+    def apply_theme(self) -> None:
+        self.setPen(pg.mkPen(self._theme.series(0), width=1))
+
+
+def outline_points(outlines: Sequence[tuple[float, float, float]]) -> NDArray[np.float64]:
+    """Squares around sub-apertures, or circles around the pupils of a pyramid sensor.
+
+    Points ``(2, n_points)``, NaN between the outlines, from centre x, y and half width of each in pixels.
+    """
+    circles = len(outlines) <= _MAX_PUPILS
+    angle = np.linspace(0, 2 * np.pi, 49) if circles else np.pi / 4 + np.linspace(0, 2 * np.pi, 5)
+    radius = 1.0 if circles else np.sqrt(2)
+    shape = np.append(radius * np.exp(1j * angle), np.nan)
+    table = np.asarray(outlines, float).reshape(-1, 3)
+    points = (table[:, :1] + 1j * table[:, 1:2] + table[:, 2:] * shape).ravel()
+    return np.stack([points.real, points.imag])

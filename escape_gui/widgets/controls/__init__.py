@@ -1,1 +1,0 @@
-"""Buttons, forms, indicators and readouts."""

@@ -1,1 +1,0 @@
-"""Images, maps and colour scales."""

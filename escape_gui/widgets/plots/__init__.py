@@ -1,1 +1,0 @@
-"""Curves against mode, iteration or time."""
