@@ -40,12 +40,7 @@ def warn_renamed(message: str) -> None:
 def renamed_attributes(module: str, names: Mapping[str, str]) -> Callable[[str], Any]:
     """A ``__getattr__`` for a module that serves old names, with a :class:`RenamedWarning`.
 
-    Parameters
-    ----------
-    module
-        ``__name__`` of the module.
-    names
-        Old name -> present name in the same module.
+    ``module`` is its ``__name__``; ``names`` maps old names to present ones in the same module.
     """
 
     def __getattr__(name: str) -> Any:
@@ -58,13 +53,7 @@ def renamed_attributes(module: str, names: Mapping[str, str]) -> Callable[[str],
 
 
 def renamed_members(**names: str) -> Callable[[T], T]:
-    """Class decorator that keeps old names of attributes and methods, with a :class:`RenamedWarning`.
-
-    Parameters
-    ----------
-    names
-        Old name -> present name.
-    """
+    """Class decorator that keeps old names, ``old="present"``, of members, with a :class:`RenamedWarning`."""
 
     def decorate(owner: T) -> T:
         for old, new in names.items():
@@ -89,14 +78,9 @@ def _member_alias(owner: str, old: str, new: str) -> property:
 
 
 def renamed_keywords(**renamed: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Decorator that accepts keywords under their old names, with a :class:`RenamedWarning`.
+    """Decorator that accepts old names, ``old="present"``, of keywords, with a :class:`RenamedWarning`.
 
     The signature of the decorated function stays that of the present names.
-
-    Parameters
-    ----------
-    renamed
-        Old name -> present name.
     """
 
     def decorate(function: Callable[P, R]) -> Callable[P, R]:

@@ -16,15 +16,7 @@ class ConfigError(EscapeError):
 
 
 class DeviceError(EscapeError):
-    """A device rejected a request, failed or was lost.
-
-    Parameters
-    ----------
-    device
-        Name of the device; the text of the exception begins with it.
-    message
-        What failed.
-    """
+    """A device rejected a request, failed or was lost; the text begins with the name of the device."""
 
     exit_code = 3
 

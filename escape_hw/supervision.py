@@ -35,16 +35,9 @@ def is_alive(pid: int, started: int | None) -> bool:
 
 
 class ChildProcess:
-    """A Python module that runs as a child process, in a session of its own.
+    """A Python module that runs as a child process, ``python -m MODULE ARGUMENTS``, in a session of its own.
 
-    Neither Ctrl-C nor the end of the terminal reaches it.
-
-    Parameters
-    ----------
-    module, arguments
-        As in ``python -m MODULE ARGUMENTS``.
-    options
-        Passed to :class:`subprocess.Popen`.
+    Neither Ctrl-C nor the end of the terminal reaches it. ``options`` are those of :class:`subprocess.Popen`.
 
     Raises
     ------
@@ -119,13 +112,7 @@ def watch_standard_input() -> threading.Event:
 
 
 class Backoff:
-    """Delays between restarts of a process: 1, 2, 4 ... 60 s, and 1 s again after it ran for 60 s.
-
-    Parameters
-    ----------
-    clock
-        Monotonic seconds.
-    """
+    """Delays between restarts of a process: 1, 2, 4 ... 60 s, and 1 s again after it ran for 60 s."""
 
     _INITIAL_S, _MAX_S, _RESET_AFTER_S = 1.0, 60.0, 60.0
 
@@ -152,16 +139,8 @@ class Backoff:
 class BackgroundThread(threading.Thread):
     """A daemon thread that logs and reports an unexpected exception instead of ending silently.
 
-    Parameters
-    ----------
-    name
-        Name in the log.
-    work
-        Called once, or every ``period_s`` seconds until :meth:`stop`.
-    period_s
-        Seconds between two calls; ``None`` for a single call.
-    on_failure
-        Called with the exception that ended ``work``, in this thread.
+    ``work`` is called once, or every ``period_s`` seconds until :meth:`stop`. ``on_failure`` is called with
+    the exception that ended it, in this thread.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""Tests on real devices: which file, which devices, how much may change. Never run by default.
+"""Tests on real devices: file, devices, allowed changes. Never run by default.
 
 Write ``--hardware=FILE`` for a file outside the checkout: pytest takes a separate word that is a path for
 a folder of tests, and looks for its configuration there.

@@ -1,4 +1,4 @@
-"""Sensors of both kinds with matrices on them, as calibrations of ours."""
+"""Sensors of both kinds with matrices on them, as calibrations of ESCAPE."""
 
 from __future__ import annotations
 

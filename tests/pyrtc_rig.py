@@ -1,4 +1,4 @@
-"""pyRTC's components in this process, on streams of their own."""
+"""pyRTC's components in this process, with separate streams."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A real ``escape`` process under way: its lines, its end, and what it cost."""
+"""A running ``escape`` process: its output, its end, and its use of resources."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A real ``escape serve`` under way, with everything it leaves behind in folders of the test's own."""
+"""A running ``escape serve``, with all its files in temporary folders."""
 
 from __future__ import annotations
 

@@ -46,13 +46,7 @@ _lock = threading.Lock()
 
 
 def shared_bench(conf: dict[str, Any]) -> Bench:
-    """The bench of a component's section; sections that agree share one. Its devices are not open.
-
-    Raises
-    ------
-    ConfigError
-        No system is named, or its configuration is wrong.
-    """
+    """The bench of a component's section; sections that agree share one. Its devices are not open."""
     system = str(conf.get("system") or "")
     if not system:
         raise ConfigError("system: ''  names no system of ESCAPE's; enter a name or a TOML file")
@@ -65,26 +59,14 @@ def shared_bench(conf: dict[str, Any]) -> Bench:
         return _benches[key]
 
 
-def clear_shared_benches() -> None:
-    """Make new benches for the components that come; those in use go on with theirs."""
-    with _lock:
-        _benches.clear()
-
-
 class EscapeCamera(WavefrontSensor):  # type: ignore[misc]  # pyRTC is not typed
     """The wavefront sensor's camera of a system as pyRTC's ``wfs``.
 
     Parameters
     ----------
     conf
-        The section ``wfs``; ``width`` and ``height`` are those of the region that the system reads.
-
-    Raises
-    ------
-    ConfigError
-        The system is wrong, or reads another region.
-    DeviceError
-        The camera cannot be opened.
+        The section ``wfs``; ``width`` and ``height`` are those of the region that the system reads, else
+        ``ConfigError`` is raised.
     """
 
     EXTRA_CONFIG_KEYS = _KEYS
@@ -131,14 +113,7 @@ class EscapeMirror(WavefrontCorrector):  # type: ignore[misc]  # pyRTC is not ty
     Parameters
     ----------
     conf
-        The section ``wfc``.
-
-    Raises
-    ------
-    ConfigError
-        The system is wrong, or its mirror has another number of actuators.
-    DeviceError
-        The mirror cannot be opened.
+        The section ``wfc``; ``num_actuators`` is that of the system, else ``ConfigError`` is raised.
     """
 
     EXTRA_CONFIG_KEYS = _KEYS

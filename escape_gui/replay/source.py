@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from escape_hw.api.optical_gains import GainsResult
-from escape_hw.api.outlines import outlines
 from escape_hw.api.registration import PARAMETERS, TO_STREAM_UNITS
 from escape_hw.api.results import CalibrationResult, LoopResult, RegistrationEstimate
 from escape_hw.remote.source import STREAMS, Sample
@@ -239,7 +238,7 @@ def _geometry_of(run: RunContent) -> Geometry:
     if main is not None:
         grid = main[1].grid
         parts |= {
-            "valid": _rows(grid.valid), "outlines_px": outlines(grid), "n_modes": main[1].matrix.n_modes,
+            "valid": _rows(grid.valid), "outlines_px": grid.outlines(), "n_modes": main[1].matrix.n_modes,
         }  # fmt: skip
     if run.layout is not None:
         parts["layout"] = _rows(run.layout)

@@ -81,6 +81,9 @@ class AdaptiveSecondary(DeformableMirror):
     hooks of a mirror, drivers implement ``_state``, ``_step``, ``_recover``, ``_measure_positions``,
     ``_health`` and, if the mirror can be observed without control, ``_observe_health``.
 
+    Every method raises :class:`NotOpen` if the mirror is not connected, and :class:`DeviceError` if it does
+    not answer.
+
     Parameters
     ----------
     name, limits
@@ -103,19 +106,13 @@ class AdaptiveSecondary(DeformableMirror):
 
     @property
     def state(self) -> ShellState:
-        """Present state. Raises :class:`NotOpen` if the mirror is not connected."""
+        """Present state."""
         self.require_open()
         return self._state()
 
     @property
     def health(self) -> ShellHealth:
-        """Present health record.
-
-        Raises
-        ------
-        NotOpen, DeviceError
-            The mirror is not connected or does not answer.
-        """
+        """Present health record."""
         self.require_open()
         return self._health()
 
@@ -126,19 +123,13 @@ class AdaptiveSecondary(DeformableMirror):
         Raises
         ------
         DeviceError
-            The mirror does not answer, or reports its health only to the client in control.
+            The mirror reports its health only to the client in control.
         """
         return self._health() if self.is_open else self._observe_health()
 
     @final
     def measured_positions(self) -> NDArray[np.float64]:
-        """Measured actuator positions ``(n_act,)``, fractions of full stroke; NaN where unreadable.
-
-        Raises
-        ------
-        NotOpen, DeviceError
-            The mirror is not connected, or did not return one position per actuator.
-        """
+        """Measured actuator positions ``(n_act,)``, fractions of full stroke; NaN where unreadable."""
         self.require_open()
         positions = np.array(self._measure_positions(), dtype=np.float64)
         if positions.shape != (self.info.n_act,):
@@ -153,8 +144,6 @@ class AdaptiveSecondary(DeformableMirror):
 
         Raises
         ------
-        NotOpen
-            The mirror is not connected.
         DeviceError
             A fault is latched, or the mirror did not reach a state.
         ValueError
@@ -185,8 +174,8 @@ class AdaptiveSecondary(DeformableMirror):
 
         Raises
         ------
-        NotOpen, DeviceError
-            The mirror is not connected, or the fault persists.
+        DeviceError
+            The fault persists.
         """
         with self._lock:
             self.require_open()

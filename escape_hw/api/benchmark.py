@@ -10,8 +10,6 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import DTypeLike
 
-Preference = Literal["higher", "lower"]
-
 
 @dataclass(frozen=True, slots=True)
 class BenchmarkRow:
@@ -41,23 +39,24 @@ class BenchmarkRow:
     peer: float | None
     peer_name: str
     unit: str
-    better: Preference
+    better: Literal["higher", "lower"]
     note: str = ""
     floor: float | None = None
 
     @property
     def reached(self) -> float | None:
         """Ratio of ``ours`` to the floor, in (0, 1]; ``None`` without a floor."""
-        if self.floor is None or self.floor == 0 or self.ours == 0:
-            return None
-        return self.ours / self.floor if self.better == "higher" else self.floor / self.ours
+        return self._relative_to(self.floor)
 
     @property
     def ratio(self) -> float | None:
         """Factor by which ``ours`` is better than ``peer``; below 1 it is worse."""
-        if self.peer is None or self.peer == 0 or self.ours == 0:
+        return self._relative_to(self.peer)
+
+    def _relative_to(self, other: float | None) -> float | None:
+        if not other or not self.ours:
             return None
-        return self.ours / self.peer if self.better == "higher" else self.peer / self.ours
+        return self.ours / other if self.better == "higher" else other / self.ours
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values for JSON, with ``ratio`` and ``reached``."""

@@ -167,12 +167,7 @@ class Camera(Device):
 
     @final
     def configure(self, want: CameraSettings) -> CameraSettings:
-        """Apply settings. Acquisition is stopped meanwhile.
-
-        Returns
-        -------
-        CameraSettings
-            The settings read back from the hardware.
+        """Apply settings and return those read back from the hardware. Acquisition is stopped meanwhile.
 
         Raises
         ------
@@ -208,12 +203,7 @@ class Camera(Device):
 
     @final
     def next_frame(self, timeout_s: float = 1.0) -> Frame:
-        """Wait for the next frame; starts acquisition when needed.
-
-        Parameters
-        ----------
-        timeout_s
-            Longest wait in seconds, on the device's clock.
+        """Wait for the next frame, at most ``timeout_s`` on the device's clock; starts acquisition if needed.
 
         Raises
         ------
@@ -240,11 +230,6 @@ class Camera(Device):
         """The next frame if one has arrived, else ``None``; starts acquisition when needed.
 
         A loop reads a slower camera this way without waiting. ``None`` does not count as a time-out.
-
-        Raises
-        ------
-        DeviceLost
-            The camera was disconnected.
         """
         self.require_open()
         self.start()

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import ctypes
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,21 +41,40 @@ class DiscoveredDevice:
 Discoverer = Callable[[Sequence[str]], list[DiscoveredDevice]]
 
 
-class NativeLibrary(Protocol):
-    """Type of an entry point of the group ``escape.libraries``, named after the driver that loads it."""
+@dataclass(frozen=True, slots=True)
+class VendorLibrary:
+    """Where a vendor's library may be; an entry point of ``escape.libraries``, named after its driver.
 
-    @property
-    def title(self) -> str:
-        """Display name."""
+    Parameters
+    ----------
+    title
+        Display name, such as "ALPAO SDK".
+    default
+        File names for the system's loader, in order of preference.
+    variable
+        Environment variable with the path of the library.
+    source
+        Where to obtain the library.
+    """
 
-    @property
-    def default(self) -> tuple[str, ...]:
-        """File names for the system's loader, in order of preference."""
+    title: str
+    default: tuple[str, ...]
+    variable: str
+    source: str
 
-    @property
-    def variable(self) -> str:
-        """Environment variable with the path of the library."""
+    def load(self, path: str = "") -> ctypes.CDLL:
+        """Load the library from ``path``, the path in the environment, or a default name.
 
-    @property
-    def source(self) -> str:
-        """Where to obtain the library."""
+        Raises
+        ------
+        OSError
+            It cannot be loaded; the message has the reason for every file tried.
+        """
+        chosen = path or os.environ.get(self.variable, "")
+        failures = []
+        for name in (chosen,) if chosen else self.default:
+            try:
+                return ctypes.CDLL(name)
+            except OSError as error:
+                failures.append(str(error))
+        raise OSError("; ".join(failures))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import abc
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from types import TracebackType
 from typing import Any, Protocol, Self
 
 
@@ -46,12 +45,7 @@ class Emulator(abc.ABC):
 
     @abc.abstractmethod
     def start(self) -> str:
-        """Start listening.
-
-        Returns
-        -------
-        str
-            The address, for example ``tcp 127.0.0.1:50000`` or ``pty /dev/pts/4``.
+        """Start listening; returns the address, such as ``tcp 127.0.0.1:50000`` or ``pty /dev/pts/4``.
 
         Raises
         ------
@@ -76,9 +70,7 @@ class Emulator(abc.ABC):
         self.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *exception: object) -> None:
         self.stop()
 
 
@@ -94,13 +86,7 @@ class StandInBench(Protocol):
         """Environment variables with which the drivers of a process find the bench."""
 
     def start(self) -> str:
-        """Start serving; returns the address.
-
-        Raises
-        ------
-        EscapeError
-            The bench cannot run on this machine, for example for lack of a C compiler.
-        """
+        """Start serving; returns the address. Raises ``EscapeError`` without a C compiler."""
 
     def stop(self) -> None:
         """Close all connections; may be repeated."""

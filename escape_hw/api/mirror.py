@@ -76,7 +76,7 @@ class DeformableMirror(Device):
 
     ``send`` is final: every command passes the :class:`~escape_hw.safety.guard.CommandGuard`.
     Drivers implement ``_open``, ``_close``, ``_send`` and set ``info`` in ``_open``. Closing first ramps
-    to the flat shape.
+    to the flat shape. Every method raises :class:`NotOpen` if the mirror is not connected.
 
     Attributes
     ----------
@@ -136,24 +136,16 @@ class DeformableMirror(Device):
 
     @final
     def send(self, command: ArrayLike) -> SendReport:
-        """Send one command through the guard.
+        """Send one command ``(n_act,)``, fractions of full stroke, through the guard.
 
-        Parameters
-        ----------
-        command
-            ``(n_act,)`` real numbers, fractions of full stroke.
-
-        Returns
-        -------
-        SendReport
-            The shape that was sent (read-only) and what the guard changed.
+        Returns the shape that was sent and what the guard changed.
 
         Raises
         ------
         CommandRejected
             Malformed or not finite; nothing is sent.
-        NotOpen, DeviceError
-            The mirror is not connected or the transfer failed.
+        DeviceError
+            The transfer failed.
         """
         # Locked because the slew rule refers to the previous command that reached the mirror.
         with self._lock:
@@ -203,8 +195,8 @@ class DeformableMirror(Device):
 
         Raises
         ------
-        NotOpen, DeviceError
-            The mirror is not connected, or did not reach the flat shape.
+        DeviceError
+            The mirror did not reach the flat shape.
         """
         with self._lock:
             guard = self._guard_when_open()

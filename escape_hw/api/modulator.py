@@ -95,12 +95,7 @@ class TipTiltModulator(Device):
 
     @final
     def modulate(self, want: Modulation) -> Modulation:
-        """Start modulating, or change the modulation.
-
-        Returns
-        -------
-        Modulation
-            The modulation read back from the stage.
+        """Start modulating, or change the modulation; returns the modulation read back from the stage.
 
         Raises
         ------
@@ -124,13 +119,7 @@ class TipTiltModulator(Device):
 
     @final
     def status(self) -> ModulatorStatus:
-        """Present status. Moves nothing; a closed stage is connected for the query.
-
-        Raises
-        ------
-        DeviceError
-            The stage does not answer.
-        """
+        """Present status. Moves nothing; a closed stage is connected for the query."""
         with self._lock:
             return self._status() if self.is_open else self._status_when_closed()
 
@@ -138,10 +127,7 @@ class TipTiltModulator(Device):
     def release(self) -> bool:
         """Disconnect without parking, for aligning the beam; the controller keeps modulating.
 
-        Returns
-        -------
-        bool
-            True if the stage keeps modulating; false if it cannot and was closed as usual.
+        Returns false if the stage cannot keep modulating and was closed as usual.
         """
         with self._lock:
             self.require_open()

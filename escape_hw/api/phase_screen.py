@@ -15,7 +15,7 @@ from escape_hw.errors import SettingRejected
 
 @dataclass(frozen=True, slots=True)
 class ScreenState:
-    """State of a phase screen: number from 0, whether it is in the beam, speed across the pupil.
+    """State of a phase screen: number from 0, whether it is in the beam, speed across the pupil (0: stopped).
 
     ``blocked`` is true while a beam stop is inserted, for dark frames.
     """
@@ -66,23 +66,7 @@ class PhaseScreen(Device):
         speed_m_s: float | None = None,
         blocked: bool | None = None,
     ) -> ScreenState:
-        """Change the given values and keep the others.
-
-        Parameters
-        ----------
-        screen
-            Number of the screen, counted from 0.
-        inserted
-            Whether the screen is in the beam.
-        speed_m_s
-            Speed across the pupil in metres per second, 0 to stop it.
-        blocked
-            Whether the beam stop is inserted.
-
-        Returns
-        -------
-        ScreenState
-            The state reached.
+        """Change the given values, see :class:`ScreenState`, and keep the others; returns the state reached.
 
         Raises
         ------
@@ -99,10 +83,9 @@ class PhaseScreen(Device):
         )
         if isinstance(want.screen, bool) or not isinstance(want.screen, int | np.integer):
             raise SettingRejected(self.name, f"screen is {want.screen!r}; it must be a whole number")
-        if not isinstance(want.inserted, bool | np.bool_):
-            raise SettingRejected(self.name, f"inserted is {want.inserted!r}; it must be true or false")
-        if not isinstance(want.blocked, bool | np.bool_):
-            raise SettingRejected(self.name, f"blocked is {want.blocked!r}; it must be true or false")
+        for name, value in (("inserted", want.inserted), ("blocked", want.blocked)):
+            if not isinstance(value, bool | np.bool_):
+                raise SettingRejected(self.name, f"{name} is {value!r}; it must be true or false")
         if not 0 <= want.screen < self.n_screens:
             raise SettingRejected(self.name, f"screen {want.screen} is not one of 0..{self.n_screens - 1}")
         if not 0 <= want.speed_m_s < math.inf:

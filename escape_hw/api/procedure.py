@@ -10,13 +10,14 @@ from collections.abc import Callable, Generator, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from types import FrameType
-from typing import Protocol, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from escape_hw.api.concurrency import SignalSafeFlag
 from escape_hw.api.representation import short_repr
+from escape_hw.deprecation import renamed_members
 from escape_hw.errors import Aborted
 
 log = logging.getLogger(__name__)
@@ -69,21 +70,17 @@ class Progress:
         return self.elapsed_s * max(0, self.total - self.done) / self.done
 
 
-class StopSignal(Protocol):
-    """Request to stop: a :class:`SignalSafeFlag` or a :class:`threading.Event`."""
-
-    def is_set(self) -> bool:
-        """Whether stopping was requested."""
-
-
+#: Request to stop.
+StopSignal = SignalSafeFlag | threading.Event
 Procedure = Generator[Progress, None, T]
 Observer = Callable[[Progress], None]
 
 
+@renamed_members(due="is_due")
 class Reporter:
     """Creates the :class:`Progress` of a stage, at most 20 times a second.
 
-    ``step`` and ``due`` are fast enough to be called for every frame.
+    ``step`` and ``is_due`` are fast enough to be called for every frame.
     """
 
     PERIOD_S = 0.05
@@ -97,9 +94,9 @@ class Reporter:
     def step(self, **metrics: float) -> Progress | None:
         """Count one step; returns a progress to yield if one is due, else ``None``."""
         self._done += 1
-        return self(self._done, **metrics) if self.due() else None
+        return self(self._done, **metrics) if self.is_due() else None
 
-    def due(self) -> bool:
+    def is_due(self) -> bool:
         """Whether the next progress is due."""
         return time.monotonic() >= self._next
 

@@ -95,9 +95,9 @@ class PyramidPupils(SensorGeometry):
     persistent_fraction: float = 0.0
     __repr__ = short_repr
 
-    def with_background(self, counts: float) -> PyramidPupils:
-        """See :meth:`SensorGeometry.with_background`."""
-        return replace(self, background=counts)
+    def outlines(self) -> tuple[tuple[float, float, float], ...]:
+        """See :meth:`SensorGeometry.outlines`."""
+        return tuple((float(x), float(y), self.diameter_px / 2) for x, y in self.centres_px)
 
     def with_slope_statistics(
         self, rms: float, pokes: float = 0.0, n_effective: float = 0.0, persistent_fraction: float = 0.0

@@ -1,17 +1,16 @@
-"""Short text and HTML representations of results for logs and notebooks, without a plotting library."""
+"""Short text and HTML representations of results for logs and notebooks."""
 
 from __future__ import annotations
 
 import base64
-import struct
-import zlib
+import io
 from collections.abc import Mapping, Sequence, Set
 from dataclasses import fields, is_dataclass
 from html import escape
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 #: Longest text, in characters, and longest series, in values, that are shown in full.
 _MAX_TEXT, _MAX_ITEMS = 60, 6
@@ -59,6 +58,8 @@ def image_html(values: ArrayLike, width: int = 240) -> str:
     width
         Width in pixels.
     """
+    from matplotlib.image import imsave
+
     image = np.atleast_2d(np.asarray(values, float))
     image = image[:: max(1, image.shape[0] // width), :: max(1, image.shape[1] // width)]
     finite = np.isfinite(image)
@@ -67,7 +68,9 @@ def image_html(values: ArrayLike, width: int = 240) -> str:
     low = np.minimum(level.astype(int), 1)
     colours = _COLOUR_STOPS[low] + (_COLOUR_STOPS[low + 1] - _COLOUR_STOPS[low]) * (level - low)[..., None]
     colours[~finite] = 160
-    data = base64.b64encode(_png(colours.astype(np.uint8))).decode()
+    png = io.BytesIO()
+    imsave(png, colours.astype(np.uint8), format="png")
+    data = base64.b64encode(png.getvalue()).decode()
     # A tall matrix is compressed to a square to fit on the page.
     height = min(round(width * image.shape[0] / image.shape[1]), width)
     return (
@@ -116,19 +119,3 @@ def table_html(
         f"<div style='display:flex;gap:12px;align-items:flex-start'>{left_html}"
         f"<div>{head}<table>{body}</table></div></div>"
     )
-
-
-def _png(pixels: NDArray[np.uint8]) -> bytes:
-    """Encode an image ``(rows, columns, 3)`` as PNG (ISO/IEC 15948)."""
-    rows, columns = pixels.shape[:2]
-    lines = np.concatenate([np.zeros((rows, 1), np.uint8), pixels.reshape(rows, -1)], axis=1)
-    parts = (
-        (b"IHDR", struct.pack(">IIBBBBB", columns, rows, 8, 2, 0, 0, 0)),
-        (b"IDAT", zlib.compress(lines.tobytes(), 9)),
-        (b"IEND", b""),
-    )
-    chunks = b"".join(
-        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-        for kind, data in parts
-    )
-    return b"\x89PNG\r\n\x1a\n" + chunks

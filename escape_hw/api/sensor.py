@@ -66,9 +66,13 @@ class SensorGeometry(abc.ABC):
         """Number of slopes: all x, then all y, over the valid sub-apertures in row-major order."""
         return 2 * self.n_valid
 
-    @abc.abstractmethod
     def with_background(self, counts: float) -> Self:
         """The geometry with this background level."""
+        return replace(self, background=counts)  # type: ignore[type-var]  # a dataclass
+
+    @abc.abstractmethod
+    def outlines(self) -> tuple[tuple[float, float, float], ...]:
+        """Outlines of sub-apertures or pupil images on the camera: (x, y, half width) in pixels each."""
 
     @abc.abstractmethod
     def with_slope_statistics(
@@ -108,17 +112,14 @@ class SlopeFunction(Protocol):
     @property
     def grid(self) -> SensorGeometry:
         """The geometry of the slopes."""
-        ...
 
     @property
     def shape(self) -> tuple[int, int]:
         """Shape of the frames (rows, columns)."""
-        ...
 
     @property
     def flux(self) -> NDArray[np.float32]:
         """Flux of each valid sub-aperture in the last frame ``(n_valid,)``, in counts."""
-        ...
 
     def __call__(
         self,
@@ -127,7 +128,6 @@ class SlopeFunction(Protocol):
         out: NDArray[np.float32] | None = None,
     ) -> NDArray[np.float32]:
         """Slopes ``(n_slopes,)``, in ``out`` if given; ``flux (n_valid,)`` is filled when given."""
-        ...
 
 
 @renamed_members(air_px="turbulence_px")
@@ -187,9 +187,9 @@ class SubApertureGrid(SensorGeometry):
             [self.origin_px[0] + columns * self.pitch_px, self.origin_px[1] + rows * self.pitch_px], axis=1
         )
 
-    def with_background(self, counts: float) -> SubApertureGrid:
-        """See :meth:`SensorGeometry.with_background`."""
-        return replace(self, background=counts)
+    def outlines(self) -> tuple[tuple[float, float, float], ...]:
+        """See :meth:`SensorGeometry.outlines`."""
+        return tuple((float(x), float(y), self.pitch_px / 2) for x, y in self.centres_px())
 
     def with_slope_statistics(
         self, rms: float, pokes: float = 0.0, n_effective: float = 0.0, persistent_fraction: float = 0.0

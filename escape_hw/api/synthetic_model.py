@@ -21,17 +21,14 @@ class SyntheticModel(Protocol):
     @property
     def name(self) -> str:
         """Name of the model in products."""
-        ...
 
     @property
     def n_act(self) -> int:
         """Number of actuators."""
-        ...
 
     @property
     def sub_aperture_m(self) -> float:
         """Size of a sub-aperture on the pupil in metres."""
-        ...
 
     def influence_functions(self) -> tuple[NDArray[np.float64], NDArray[np.bool_], float]:
         """Nominal influence functions for the modal basis.
@@ -44,7 +41,6 @@ class SyntheticModel(Protocol):
         pixel_m : float
             Pixel size on the pupil in metres.
         """
-        ...
 
     def zonal_matrix(self, registration: Registration, width: float = 1.0) -> NDArray[np.float64]:
         """Slopes per unit command of each actuator.
@@ -61,7 +57,6 @@ class SyntheticModel(Protocol):
         ndarray, ``(n_slopes, n_act)``
             In the slope unit of the sensor, all x then all y over the valid sub-apertures.
         """
-        ...
 
     def variants(self) -> Sequence[Self]:
         """Models that differ from this one by one standard deviation of an uncertain parameter.
@@ -69,7 +64,6 @@ class SyntheticModel(Protocol):
         SPRINT fits the amplitude of each difference, which removes its bias from the registration and adds
         its uncertainty to the standard errors. Empty if there is no such parameter.
         """
-        ...
 
 
 @runtime_checkable
@@ -92,7 +86,6 @@ class HasSystematicError(Protocol):
 
         SPRINT adds them to its standard errors, because no interaction matrix shows them.
         """
-        ...
 
 
 @runtime_checkable
@@ -102,7 +95,6 @@ class HasGainTrend(Protocol):
     @property
     def gain_trend(self) -> float:
         """Prior standard deviation of the relative change of slope gain from centre to rim; 0: none."""
-        ...
 
 
 @runtime_checkable
@@ -112,7 +104,6 @@ class HasSlopeWeights(Protocol):
     @property
     def slope_weights(self) -> NDArray[np.float64]:
         """Weights of the squared slopes ``(n_slopes,)``, in (0, 1]."""
-        ...
 
 
 @runtime_checkable
@@ -127,7 +118,6 @@ class HasPupilShift(Protocol):
         shift_x, shift_y
             In % of a sub-aperture, positive towards higher columns and rows.
         """
-        ...
 
 
 @runtime_checkable
@@ -158,16 +148,13 @@ class DifferentiableModel(SyntheticModel, Protocol):
         ndarray, ``(n_slopes, n_modes)``
             ``zonal_matrix(registration, width) @ m2c``, at least in single precision.
         """
-        ...
 
     def modal_jacobian(
         self, registration: Registration, m2c: NDArray[np.float64], width: float = 1.0
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Slopes per unit of each mode ``(n_slopes, n_modes)``, derivatives ``(6, n_slopes, n_modes)``."""
-        ...
 
     def zonal_jacobian(
         self, registration: Registration, width: float = 1.0
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Slopes per unit command ``(n_slopes, n_act)``, and derivatives ``(6, n_slopes, n_act)``."""
-        ...

@@ -27,12 +27,14 @@ from escape_hw.runtime.procedures.declaration import ComputedProcedure
 
 if TYPE_CHECKING:
     from escape_hw.api.procedure import Procedure
-    from escape_hw.cli.calibration.display import Display
     from escape_hw.cli.options import SystemSelection
     from escape_hw.config.system import SystemConfig
     from escape_hw.io.run_folder import RunFolder
     from escape_hw.runtime.procedures.declaration import ProcedureSpec
     from escape_hw.runtime.session.system import System
+
+
+T = TypeVar("T")
 
 
 class InterruptHandler:
@@ -41,11 +43,7 @@ class InterruptHandler:
     While a procedure runs, the first signal sets ``abort`` and the second raises ``KeyboardInterrupt``.
     While the devices are being closed or an aborted run is saved, signals are ignored, so that the mirror
     is flattened and the data are written. At any other time a signal raises ``KeyboardInterrupt``.
-
-    Parameters
-    ----------
-    notify
-        Called with a line for the operator, from the signal handler.
+    ``notify`` is called with a line for the operator, from the signal handler.
     """
 
     def __init__(self, notify: Callable[[str], None]) -> None:
@@ -79,13 +77,17 @@ class InterruptHandler:
         finally:
             self._in_procedure = False
 
-    def begin_closing(self) -> None:
-        """Ignore signals until :meth:`end_closing`."""
-        self._protected_activity = "the mirror is being flattened and the devices closed"
-
-    def end_closing(self) -> None:
-        """Handle signals again."""
-        self._protected_activity = ""
+    @contextmanager
+    def protect_closing(self, opened: AbstractContextManager[T]) -> Iterator[T]:
+        """Enter a device, system or server, and ignore signals while it is closed."""
+        try:
+            with opened as entered:
+                try:
+                    yield entered
+                finally:
+                    self._protected_activity = "the mirror is being flattened and the devices closed"
+        finally:
+            self._protected_activity = ""
 
     @contextmanager
     def protect_saving(self) -> Iterator[None]:
@@ -106,7 +108,6 @@ class InterruptHandler:
             raise KeyboardInterrupt
 
 
-T = TypeVar("T")
 log = logging.getLogger(__name__)
 
 _PIPE_WIDTH = 120
@@ -161,14 +162,17 @@ class CommandContext:
         self._document = document
         self.code = self.code or (DONE if met else FAILED)
 
-    def load_config(self, selection: SystemSelection) -> SystemConfig:
-        """The configuration of the selected system; its name, mode and seed then appear in error documents.
+    def report(self, met: bool = True, **content: Any) -> None:
+        """Set the document of a command without a run: its header, and this content.
 
-        Raises
-        ------
-        ConfigError
-            The configuration is wrong.
+        The header has system, mode and seed as loaded, unless ``content`` has others.
         """
+        from escape_hw.io.documents import header_fields
+
+        self.result({**header_fields(self.command, **self._subject), **content}, met)
+
+    def load_config(self, selection: SystemSelection) -> SystemConfig:
+        """The configuration of the selected system; error documents then have its name, mode and seed."""
         from escape_hw.config.bundled import bundled_systems
         from escape_hw.config.loader import load_system
 
@@ -225,29 +229,19 @@ class CommandContext:
         procedure: ProcedureSpec[T],
         selection: SystemSelection,
         out: Path | None,
-        display: Display,
         resumed_run: Path | None = None,
     ) -> None:
-        """Run a procedure on the selected system, save its result and print it.
+        """Run a requested procedure on the selected system, save its result and print it.
 
-        Parameters
-        ----------
-        procedure
-            The request.
-        selection
-            The system.
-        out
-            Run folder; a dated one by default.
-        display
-            Prints the result.
-        resumed_run
-            Folder of the run that is continued.
+        Products go to ``out``, by default a dated folder; the folder of a continued run is not changed.
 
         Raises
         ------
         Aborted
             The result is partial; it was saved and printed.
         """
+        from escape_hw.cli.calibration.display import show_result
+
         selection = selection.with_overrides(*procedure.overrides)
         config = self.load_config(selection)
         procedure.load(config)
@@ -258,7 +252,7 @@ class CommandContext:
                 result = self.run(procedure.compute())
                 saved = procedure.save_computed(folder, result, self.wall_seconds)
                 self.result(saved.document, met=saved.met)
-                display(self, result, config.simulated, saved.document)
+                show_result(self, procedure.name, result, saved.document["simulated"], saved.document)
                 return
             with self.bench(selection) as bench:
                 from escape_hw.runtime.session.record import BenchRecord
@@ -268,7 +262,7 @@ class CommandContext:
             with self.protect_saving(stop):
                 saved = procedure.save(folder, record, result, self.wall_seconds)
                 self.result(saved.document, met=saved.met)
-                display(self, result, record.simulated, saved.document)
+                show_result(self, procedure.name, result, record.simulated, saved.document)
             if stop is not None:
                 raise stop
             procedure.finish()
@@ -290,33 +284,21 @@ class CommandContext:
             folder.write_config(config.to_toml())
             yield folder
 
-    @contextmanager
-    def bench(self, selection: SystemSelection) -> Iterator[System]:
+    def bench(self, selection: SystemSelection) -> AbstractContextManager[System]:
         """The open system; finally the mirror is flattened and the devices are closed."""
         from escape_hw.runtime.session.system import open_system
 
         self._require_not_served(selection)
-        opened_system = open_system(
-            selection.system, set=selection.set, seed=selection.seed, mode=selection.mode
-        )
+        system = open_system(selection.system, set=selection.set, seed=selection.seed, mode=selection.mode)
+        return self.opened(system)
+
+    def opened(self, device: AbstractContextManager[T]) -> AbstractContextManager[T]:
+        """Open a device or system, and close it at the end; a Ctrl-C does not interrupt the closing."""
         self.devices_opened = True
-        try:
-            with opened_system as system:
-                try:
-                    yield system
-                finally:
-                    self.interrupts.begin_closing()
-        finally:
-            self.interrupts.end_closing()
+        return self.interrupts.protect_closing(device)
 
     def _require_not_served(self, selection: SystemSelection) -> None:
-        """Refuse to open hardware that a server has opened.
-
-        Raises
-        ------
-        ConfigError
-            A server has opened the system; the message names its process and the alternatives.
-        """
+        """Refuse to open hardware that a server has opened."""
         from escape_hw.remote.address import find_server
 
         config = self.load_config(selection)
@@ -336,17 +318,10 @@ class CommandContext:
         self.notify(f"{'aborted' if code == ABORTED else 'error'}: {message}")
         for note in getattr(error, "__notes__", ()):
             self.notify(f"  {note}")
-        document = dict(self._document or self._error_document())
-        document["error"] = {"type": kind, "message": message}
-        self._document = document
+        if self._document is None:
+            self.report(**({} if self.folder is None else self.folder.location_fields()))
+        self._document = {**(self._document or {}), "error": {"type": kind, "message": message}}
         return code
-
-    def _error_document(self) -> dict[str, Any]:
-        """Document of a command without a result."""
-        from escape_hw.io.documents import header_fields
-
-        known = header_fields(self.command, **self._subject)
-        return known if self.folder is None else {**known, **self.folder.location_fields()}
 
     def _classify_error(self, error: BaseException) -> tuple[int, str, str]:
         if isinstance(error, KeyboardInterrupt):

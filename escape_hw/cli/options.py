@@ -8,7 +8,6 @@ from typing import Annotated
 
 import typer
 
-System = Annotated[str, typer.Argument(help="Name of a system (see 'escape systems') or a TOML file.")]
 Json = Annotated[bool, typer.Option("--json", help="Print exactly one JSON document on standard output.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress bars.")]
 Out = Annotated[
@@ -37,9 +36,14 @@ class SystemSelection:
         """The selection with further overrides, applied last."""
         return replace(self, set=(*self.set, *overrides))
 
-    @classmethod
-    def of(
-        cls, system: str, overrides: list[str] | None, seed: int | None, mode: str | None
-    ) -> SystemSelection:
-        """From the values of the options."""
-        return cls(system, tuple(overrides or ()), seed, mode)
+
+#: A command's system, named by its argument; see :func:`~escape_hw.cli.command.command`.
+Selection = Annotated[
+    SystemSelection, typer.Argument(help="Name of a system (see 'escape systems') or a TOML file.")
+]
+#: Default of a command whose argument may be left out.
+NO_SYSTEM = SystemSelection("")
+OptionalSelection = Annotated[
+    SystemSelection,
+    typer.Argument(help="Name of a system (see 'escape systems') or a TOML file; not with --resume."),
+]

@@ -22,14 +22,8 @@ _FAILED = 1
 class FaultTolerantStream:
     """A text stream that never raises; output that cannot be written is discarded.
 
-    Parameters
-    ----------
-    inner
-        The stream itself; ``None`` if the process was started without it.
-    descriptor
-        File descriptor of the stream.
-    on_failure
-        Called once, with the error of the first failed write.
+    ``inner`` is ``None`` if the process was started without the stream. ``on_failure`` is called once, with
+    the error of the first failed write.
     """
 
     def __init__(self, inner: TextIO | None, descriptor: int, on_failure: Callable[[OSError], None]) -> None:
@@ -75,13 +69,8 @@ class FaultTolerantStream:
 class OutputStreams:
     """Replaces both standard streams while a command runs.
 
-    A failure of standard output fails the command; a failure of standard error does not.
-
-    Parameters
-    ----------
-    document
-        Standard output is one document. A table may be cut off without a message, as by ``| head``; a
-        document may not.
+    A failure of standard output fails the command; a failure of standard error does not. A table may be cut
+    off without a message, as by ``| head``; a ``document`` may not.
     """
 
     def __init__(self, document: bool) -> None:

@@ -13,6 +13,7 @@ _OPTIONS = {
         "--drop": "--dropped-modes", "--heats": "--replicates", "--finals": "--final-replicates"
     },
     "reproduce": {"--plants": "--realisations"},
+    "import": {"--legacy": "--frame-order"},
 }  # fmt: skip
 
 

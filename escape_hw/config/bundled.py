@@ -40,12 +40,9 @@ def bundled_text(name: str) -> str:
 
 
 def find_system(system: str | os.PathLike[str]) -> tuple[str, str]:
-    """The TOML text of a system, and the name of its source for messages.
+    """The TOML text of a bundled system or of a file, and the name of its source for messages.
 
-    Parameters
-    ----------
-    system
-        Name of a bundled system, or path of a TOML file (it ends in ``.toml`` or contains a folder).
+    The path of a file ends in ``.toml`` or contains a folder.
 
     Raises
     ------

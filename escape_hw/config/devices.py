@@ -155,16 +155,10 @@ class LimitsConfig(Section):
         None, gt=0, le=2, description="largest change from one command to the next, fraction of full stroke"
     )
     max_neighbour: float | None = Field(
-        None,
-        gt=0,
-        le=2,
-        description="largest difference between adjacent actuators, fraction of full stroke",
+        None, gt=0, le=2, description="largest difference between adjacent actuators, fraction of full stroke"
     )
     max_mean: float | None = Field(
-        None,
-        gt=0,
-        le=1,
-        description="largest magnitude of the mean command (piston), fraction of full stroke",
+        None, gt=0, le=1, description="largest magnitude of the mean (piston), fraction of full stroke"
     )
     disabled: TomlArray[tuple[Annotated[int, Field(ge=0)], ...]] = Field(
         (), description="indices of the actuators that must stay at zero"
@@ -188,9 +182,7 @@ class MirrorConfig(DeviceConfig):
         gt=0, le=200, description="actuator pitches across the diameter of the pupil"
     )
     coupling: float = Field(
-        ge=0.01,
-        le=0.9,
-        description="nominal influence function at the adjacent actuator, fraction of its peak",
+        ge=0.01, le=0.9, description="nominal influence at the adjacent actuator, fraction of the peak"
     )
     stroke_m: float = Field(gt=0, le=1e-3, description="metres of surface at the actuator for a command of 1")
     limits: LimitsConfig = Field(default_factory=LimitsConfig, description="limits of every command")
@@ -211,17 +203,7 @@ class MirrorConfig(DeviceConfig):
         return actuator_layouts.positions(self.layout)
 
     def info(self, model: str, *, simulated: bool, serial: str = "") -> DMInfo:
-        """Identity and nominal geometry for a driver or twin.
-
-        Parameters
-        ----------
-        model
-            Model of the device.
-        simulated
-            Whether it is a twin.
-        serial
-            Serial number read from the device; by default as configured.
-        """
+        """Identity and nominal geometry for a driver or twin; ``serial`` is by default as configured."""
         positions_m = self.positions() * self.pitch_m
         return DMInfo(
             model,

@@ -57,16 +57,9 @@ def is_free_table(field: FieldInfo) -> bool:
 class KeyLocation:
     """Result of following a path through the models.
 
-    Parameters
-    ----------
-    path
-        The path as in files, without the tags that a validation inserts.
-    field
-        The field at the path; ``None`` if the path does not exist.
-    existing
-        The part of ``path`` that exists, including items of arrays and of free tables.
-    candidate_sections
-        The sections that could contain the first missing key; empty if the whole path exists.
+    ``path`` is as in files, without the tags that a validation inserts; ``field`` the field there, ``None``
+    if the path does not exist; ``existing`` the part that exists, with items of arrays and free tables;
+    ``candidate_sections`` the sections that could contain the first missing key.
     """
 
     path: KeyPath

@@ -46,15 +46,15 @@ _MESSAGES = {
 
 @dataclass(frozen=True, slots=True)
 class ConfigProblem:
-    """One invalid key: its path, its value as text (may be empty), the problem and the remedy."""
+    """One invalid key: its path, its value (``None``: it is missing), the problem and the remedy."""
 
     path: KeyPath
-    value: str
+    value: Any
     message: str
 
     def line(self, where: str) -> str:
         """The problem on one line that begins with its place, for example ``file:line``."""
-        value = f" {self.value}" if self.value else ""
+        value = "" if self.value is None else f" {format_short(self.value)}"
         return f"{where}  {key_tree.dotted(self.path)}:{value}  {self.message}"
 
 
@@ -63,8 +63,8 @@ def unknown_key_problem(path: Sequence[str | int], value: Any) -> ConfigProblem:
     plain = key_tree.locate_key(path).path
     if key_tree.locate_key(plain).existing == plain:
         others = ", ".join(f"'{kind}'" for kind in key_tree.kinds_with_key(plain))
-        return ConfigProblem(plain, format_short(value), f"is a key of kind = {others} only")
-    return ConfigProblem(plain, format_short(value), f"unknown key{_hint(key_tree.closest_key(path))}")
+        return ConfigProblem(plain, value, f"is a key of kind = {others} only")
+    return ConfigProblem(plain, value, f"unknown key{_hint(key_tree.closest_key(path))}")
 
 
 def problems_from(error: ValidationError) -> list[ConfigProblem]:
@@ -90,42 +90,31 @@ def _translate(detail: ErrorDetails) -> list[ConfigProblem]:
     place = key_tree.locate_key(detail["loc"])
     path, field, existing = place.path, place.field, place.existing
     if kind == RULE_ERROR:
-        return [
-            ConfigProblem(
-                (*path, *violation.key.split(".")), format_short(violation.value), violation.message
-            )
-            for violation in detail["ctx"]["violations"]
-        ]
+        violations = detail["ctx"]["violations"]
+        return [ConfigProblem((*path, *one.key.split(".")), one.value, one.message) for one in violations]
     if kind == "extra_forbidden":
         return [unknown_key_problem(detail["loc"], value)]
     if kind == "union_tag_invalid":
         return [_wrong_kind((*path, "kind"), value, field)]
     if field is None:
-        return [ConfigProblem(path, format_short(value), _message(detail))]
+        return [ConfigProblem(path, value, _message(detail))]
     if key_tree.is_free_table(field) and kind != "dict_type":
-        return [ConfigProblem(existing, format_short(value), "must be text, a number, true or false")]
+        return [ConfigProblem(existing, value, "must be text, a number, true or false")]
     item = existing[-1] if isinstance(existing[-1], int) else None
     allowed = key_tree.range_text(field, item)
     hints = [f"allowed range {allowed}"] if allowed else []
     if kind == "missing":
         if item is not None:
-            return [
-                ConfigProblem(
-                    existing[:-1],
-                    format_short(list(value)),
-                    f"has too few items; expected: {field.description}",
-                )
-            ]
+            text = f"has too few items; expected: {field.description}"
+            return [ConfigProblem(existing[:-1], list(value), text)]
         hints.insert(0, field.description or "")
-        return [ConfigProblem(path, "", f"is missing ({'; '.join(hints)})")]
+        return [ConfigProblem(path, None, f"is missing ({'; '.join(hints)})")]
     if kind == "literal_error":
-        return [ConfigProblem(path, format_short(value), _wrong_choice(detail))]
+        return [ConfigProblem(path, value, _wrong_choice(detail))]
     if kind == "string_pattern_mismatch":
-        return [ConfigProblem(path, format_short(value), f"is not allowed; expected: {field.description}")]
-    message = _message(detail)
-    return [
-        ConfigProblem(existing, format_short(value), message + (f" ({'; '.join(hints)})" if hints else ""))
-    ]
+        return [ConfigProblem(path, value, f"is not allowed; expected: {field.description}")]
+    hint = f" ({'; '.join(hints)})" if hints else ""
+    return [ConfigProblem(existing, value, _message(detail) + hint)]
 
 
 def _message(detail: ErrorDetails) -> str:
@@ -136,7 +125,7 @@ def _wrong_kind(path: KeyPath, table: Any, field: FieldInfo | None) -> ConfigPro
     kinds = [] if field is None else list(key_tree.sections_of(field.annotation))
     value = table["kind"]
     hint = _hint(key_tree.closest_match(str(value), kinds))
-    return ConfigProblem(path, format_short(value), f"must be {' or '.join(map(repr, kinds))}{hint}")
+    return ConfigProblem(path, value, f"must be {' or '.join(map(repr, kinds))}{hint}")
 
 
 def _wrong_choice(detail: ErrorDetails) -> str:
@@ -202,8 +191,7 @@ def apply_overrides(
         for depth, name in enumerate(path[:-1], start=1):
             inner = table.setdefault(name, {})
             if not isinstance(inner, dict):
-                problem = ConfigProblem(path[:depth], format_short(inner), "must be a table")
-                problems.append((override, problem))
+                problems.append((override, ConfigProblem(path[:depth], inner, "must be a table")))
                 break
             table = inner
         else:

@@ -22,16 +22,9 @@ T = TypeVar("T")
 
 
 def require_factory(what: str, where: str, factory: object, parameters: Sequence[str]) -> None:
-    """Check that an object can be called as a factory.
+    """Check that an object can be called as a factory with positional arguments of these names.
 
-    Parameters
-    ----------
-    what, where
-        Description and location of the object, for the message.
-    factory
-        The object.
-    parameters
-        Names of the positional arguments.
+    ``what`` and ``where`` describe the object in the message.
 
     Raises
     ------
@@ -58,16 +51,7 @@ def require_factory(what: str, where: str, factory: object, parameters: Sequence
 
 
 def call_factory(what: str, kind: type[T], factory: Callable[..., object], *arguments: Any) -> T:
-    """Call a factory and check the type of its result.
-
-    Parameters
-    ----------
-    what
-        Description of the factory, for the message.
-    kind
-        Required type of the result.
-    factory, arguments
-        The factory and its arguments.
+    """Call a factory and check the type of its result; ``what`` describes it in messages.
 
     Raises
     ------
@@ -168,14 +152,7 @@ def available(group: str) -> tuple[str, ...]:
 
 
 def device_factory(name: str, *, hardware: bool = False) -> DeviceFactory:
-    """The factory of a driver or twin.
-
-    Parameters
-    ----------
-    name
-        Name of the driver or twin.
-    hardware
-        Whether a driver for real hardware is required; the message then suggests no twins.
+    """The factory of a driver or twin; with ``hardware``, messages suggest no twins.
 
     Raises
     ------
@@ -213,7 +190,7 @@ def _load(group: str, name: str, hardware: bool = False) -> Any:
         entry.value: entry for entry in importlib.metadata.entry_points(group=group) if entry.name == name
     }
     if not entries:
-        raise ConfigError(_no_driver_message(name) if hardware else _unknown_name_message(group, name))
+        raise ConfigError(_unknown_name_message(group, name, hardware))
     if len(entries) > 1:
         owners = " and ".join(f"{value} ({_package(entry)})" for value, entry in sorted(entries.items()))
         raise ConfigError(f"{kind} '{name}' is provided twice: {owners}; uninstall one of the packages")
@@ -230,26 +207,17 @@ def _load(group: str, name: str, hardware: bool = False) -> Any:
     return factory
 
 
-def _unknown_name_message(group: str, name: str) -> str:
-    known = available(group)
+def _unknown_name_message(group: str, name: str, hardware: bool) -> str:
+    kind, known = _KINDS[group], available(group)
+    none = "none: is escape-hw itself installed in this environment?"
+    install = f"install the package that provides it as an entry point in '{group}'"
+    if hardware:
+        known = tuple(driver for driver in known if not driver.startswith(TWIN_PREFIX))
+        kind, none = "driver for real hardware", "none, only twins"
+        install += ", or use the twin (--mode sim)"
     suggestion = closest_match(name, known)
     hint = f"did you mean '{suggestion}'? " if suggestion else ""
-    listing = ", ".join(known) if known else "none: is escape-hw itself installed in this environment?"
-    return (
-        f"no {_KINDS[group]} '{name}' is installed ({hint}installed: {listing}); "
-        f"install the package that provides it as an entry point in '{group}'"
-    )
-
-
-def _no_driver_message(name: str) -> str:
-    real = tuple(driver for driver in available(DEVICES) if not driver.startswith(TWIN_PREFIX))
-    suggestion = closest_match(name, real)
-    hint = f"did you mean '{suggestion}'? " if suggestion else ""
-    return (
-        f"no driver '{name}' for real hardware is installed ({hint}"
-        f"installed: {', '.join(real) if real else 'none, only twins'}); install the package that provides "
-        f"'{name}' as an entry point in '{DEVICES}', or use the twin (--mode sim)"
-    )
+    return f"no {kind} '{name}' is installed ({hint}installed: {', '.join(known) or none}); {install}"
 
 
 def _missing_module_message(kind: str, entry: importlib.metadata.EntryPoint, error: ImportError) -> str:

@@ -88,15 +88,7 @@ def present_key(path: tuple[str | int, ...]) -> tuple[str | int, ...]:
 
 
 def present_value(key: str, value: T) -> T:
-    """The present name of a value that was given as an argument, with a deprecation warning.
-
-    Parameters
-    ----------
-    key
-        The key with the same values, for example ``"calibration.solver"``.
-    value
-        The value as given; values that are not renamed are returned unchanged.
-    """
+    """The present name of a value of a key such as ``"calibration.solver"``; warns if it was an old one."""
     new: Any = RENAMED_VALUES.get(key, {}).get(value) if isinstance(value, str) else None
     if new is None:
         return value

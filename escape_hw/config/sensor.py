@@ -39,10 +39,7 @@ class ShackHartmannSection(SensorSection):
     pitch_px: float = Field(ge=2, le=1000, description="nominal pitch of the lenslets, camera pixels")
     spot_px: float = Field(ge=0.5, le=200, description="lambda/d of a sub-aperture, camera pixels")
     threshold: float = Field(
-        0.02,
-        ge=0,
-        le=0.9,
-        description="centre-of-gravity threshold above the background, fraction of full scale",
+        0.02, ge=0, le=0.9, description="centre-of-gravity threshold above background, fraction of full scale"
     )
 
 

@@ -54,10 +54,7 @@ class TrackingSection(Section):
         description="closed-loop pokes are uniform in +-poke, rms surface as fraction of full stroke",
     )
     forgetting_time_s: float = Field(
-        10.0,
-        ge=1,
-        le=1e5,
-        description="time constant of forgetting (to 1/e) in the live registration, seconds",
+        10.0, ge=1, le=1e5, description="time constant of forgetting (1/e) in the live registration, seconds"
     )
     exchange_threshold: float = Field(
         0.01, gt=0, le=1, description="relative change of the matrix above which an exchange is proposed"
@@ -80,10 +77,7 @@ class ServerSection(Section):
         5.0, ge=1.5, le=600, description="a client with the write lease loses it after this silence, seconds"
     )
     unattended_s: float = Field(
-        10.0,
-        ge=0.5,
-        le=3600,
-        description="a procedure without a lease holder is aborted after this time, seconds",
+        10.0, ge=0.5, le=3600, description="a procedure without a lease holder is aborted after this, seconds"
     )
     engine_silence_s: float = Field(
         10.0,
@@ -136,8 +130,7 @@ class BasisSection(Section):
     """Modal basis of the calibration."""
 
     kind: Literal["kl", "zonal", "zernike", "fourier", "file"] = Field(
-        "kl",
-        description="'kl' (Karhunen-Loeve), 'zonal' (single actuators), 'zernike', 'fourier' or 'file'",
+        "kl", description="'kl' (Karhunen-Loeve), 'zonal' (single actuators), 'zernike', 'fourier' or 'file'"
     )
     n_modes: int = Field(ge=1, le=10000, description="number of modes")
     file: str = Field("", description="FITS file of the mode-to-command matrix, for kind = 'file'")
@@ -167,16 +160,10 @@ class CalibrationSection(Section):
     """Defaults of the calibration procedures."""
 
     poke: float = Field(
-        0.02,
-        gt=0,
-        le=1,
-        description="DO-CRIME: pokes are uniform in +-poke, rms surface as fraction of full stroke",
+        0.02, gt=0, le=1, description="DO-CRIME: uniform in +-poke, rms surface as fraction of full stroke"
     )
     poke_command: float = Field(
-        0.1,
-        gt=0,
-        le=1,
-        description="largest actuator command in the poke of one mode, fraction of full stroke",
+        0.1, gt=0, le=1, description="largest command in the poke of one mode, fraction of full stroke"
     )
     pokes: PokePattern = Field(
         "white",
@@ -201,8 +188,7 @@ class CalibrationSection(Section):
         5.0, gt=0, description="interval between checkpoints of a calibration, seconds"
     )
     estimator: Estimator = Field(
-        "auto",
-        description="SPRINT: fit the 'matrix' or the whitened 'telemetry'; 'auto': telemetry where possible",
+        "auto", description="SPRINT: fit the 'matrix' or whitened 'telemetry'; 'auto': telemetry if possible"
     )
     sprint_modes: int = Field(50, ge=1, le=10000, description="SPRINT: largest number of modes used")
     modes_choice: ModesChoice = Field(

@@ -27,12 +27,7 @@ def json_schema() -> dict[str, Any]:
 def starter_text(name: str = "my-system", base: str = "razor-shwfs") -> str:
     """A complete system file with the meaning, unit and range of every key as comments.
 
-    Parameters
-    ----------
-    name
-        Name of the new system.
-    base
-        Bundled system that provides the values.
+    The values are those of the bundled system ``base``.
 
     Raises
     ------

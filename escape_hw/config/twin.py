@@ -156,10 +156,7 @@ class TwinContamination(Section):
         0.0, ge=0, le=0.5, description="smooth variation of the illumination over the pupil, rms fraction"
     )
     edge_unevenness: float = Field(
-        0.0,
-        ge=0,
-        le=0.2,
-        description="variation of the pupil radius along the circumference, rms fraction",
+        0.0, ge=0, le=0.2, description="variation of the pupil radius along the circumference, rms fraction"
     )
 
 
@@ -172,10 +169,7 @@ class TwinRegistration(Section):
     radial_scaling: float = Field(0.0, ge=-30, le=30, description="scaling along x, % of the diameter")
     tangential_scaling: float = Field(0.0, ge=-30, le=30, description="scaling along y, % of the diameter")
     anamorphosis_angle: float = Field(
-        0.0,
-        ge=-180,
-        le=180,
-        description="rotation of the axes of the two scalings from +y towards +x, degrees",
+        0.0, ge=-180, le=180, description="rotation of the axes of the scalings from +y towards +x, degrees"
     )
 
     def to_registration(self) -> Registration:
@@ -194,19 +188,13 @@ class TwinMirror(Section):
         0.0, ge=0, le=0.5, description="scatter of the widths of the influence functions, rms fraction"
     )
     wing_fraction: float = Field(
-        0.0,
-        ge=0,
-        le=0.5,
-        description="fraction of each influence function in wings wider than its core",
+        0.0, ge=0, le=0.5, description="fraction of each influence function in wings wider than its core"
     )
     influence_file: str = Field(
         "", description="FITS file of measured influence functions (n_act, n, n); empty: Gaussians"
     )
     influence_pixel_m: float | None = Field(
-        None,
-        gt=0,
-        le=10,
-        description="pixel size of influence_file on the pupil, metres; required with a file",
+        None, gt=0, le=10, description="pixel size of influence_file on the pupil, metres; needed with a file"
     )
     settling_s: float = Field(
         0.0, ge=0, le=1, description="time constant of the response to a command, seconds"
@@ -266,16 +254,10 @@ class TwinPyramid(Section):
         0.0, ge=0, le=5, description="length of the roof edge at the tip of the pyramid, lambda/D"
     )
     ellipse: float = Field(
-        0.0,
-        ge=-0.5,
-        le=0.5,
-        description="relative difference of the modulation radii along x and y, fraction",
+        0.0, ge=-0.5, le=0.5, description="relative difference of the modulation radii in x and y, fraction"
     )
     phase: float = Field(
-        0.0,
-        ge=-60,
-        le=60,
-        description="deviation of the phase between the modulation axes from 90 degrees, degrees",
+        0.0, ge=-60, le=60, description="error of the 90 degree phase between the modulation axes, degrees"
     )
     drift: float = Field(
         0.0, ge=0, le=5, description="amplitude of the slow drift of the modulation centre, lambda/D"

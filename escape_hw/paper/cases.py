@@ -24,17 +24,12 @@ from escape_hw.paper.experiments import (
     reproduce_table1,
 )
 from escape_hw.runtime.procedures import criteria
-from escape_hw.runtime.procedures.calibration_comparison import (
-    WITH_GAINS,
-    CalibrationComparison,
-    measured_calibration,
-)
+from escape_hw.runtime.procedures.calibration import measured_calibration
+from escape_hw.runtime.procedures.calibration_comparison import WITH_GAINS, CalibrationComparison
 from escape_hw.runtime.procedures.products import (
-    add_calibration,
-    add_gains,
-    add_loop,
+    add_result,
     product_key,
-    write_run_result,
+    save_run,
 )
 from escape_hw.runtime.session.record import BenchRecord
 
@@ -94,14 +89,14 @@ def save_comparison(
     """
     saved: dict[str, Path] = {}
     for label, calibration in result.calibrations.items():
-        parents = {"docrime": saved["DO-CRIME"]} if label == "ESCAPE" and "DO-CRIME" in saved else {}
-        saved[label] = add_calibration(folder, record, product_key(label), calibration, parents)
+        parents = [saved["DO-CRIME"]] if label == "ESCAPE" and "DO-CRIME" in saved else []
+        saved[label] = add_result(folder, record, product_key(label), calibration, *parents)
     for label, loop in result.loops.items():
         # A matrix scaled by its optical gains comes from the one saved.
-        add_loop(folder, record, f"loop_{product_key(label)}", loop, saved[label.removesuffix(WITH_GAINS)])
+        add_result(folder, record, f"loop_{product_key(label)}", loop, saved[label.removesuffix(WITH_GAINS)])
     if result.gains is not None:
-        others = {product_key(label): saved[label] for label in result.gains.comparisons}
-        add_gains(folder, record, "gains", result.gains, {"im": saved["ESCAPE"], **others})
+        others = [saved[label] for label in result.gains.comparisons]
+        add_result(folder, record, "gains", result.gains, saved["ESCAPE"], *others)
     escape = result.calibrations.get("ESCAPE")
     estimate = None if escape is None else escape.registration
     checks = []
@@ -115,21 +110,18 @@ def save_comparison(
     labels: dict[str, Any] = {product_key(label): {"label": label} for label in result.calibrations}
     labels |= {f"loop_{product_key(label)}": {"label": label} for label in result.loops}
     labels.setdefault("escape", {}).update(measured="DO-CRIME", column="")
-    document = {
-        **record.header_fields(command),
-        "title": f"{title}: {record.system}",
-        "calibrations": {k: documents.calibration_document(v) for k, v in result.calibrations.items()},
+    return save_run(
+        folder, record, command, f"{title}: {record.system}", wall_seconds,
+        calibrations={k: documents.calibration_document(v) for k, v in result.calibrations.items()},
         **documents.registration_document(estimate),
-        "loops": {label: documents.loop_document(loop) for label, loop in result.loops.items()},
-        "scans": {k: [documents.loop_document(run) for run in runs] for k, runs in result.scans.items()},
-        "criteria": checks,
-        "labels": labels,
-        "partial": result.partial,
-        "notes": list(result.notes),
+        loops={label: documents.loop_document(loop) for label, loop in result.loops.items()},
+        scans={k: [documents.loop_document(run) for run in runs] for k, runs in result.scans.items()},
+        criteria=checks,
+        labels=labels,
+        partial=result.partial,
+        notes=list(result.notes),
         **({"sky_time": result.sky_time} if result.sky_time else {}),
-        **record.footer_fields(wall_seconds),
-    }
-    return write_run_result(folder, document)
+    )  # fmt: skip
 
 
 def save_table1(
@@ -141,15 +133,15 @@ def save_table1(
         estimate = calibration.registration
         # Stopped before SPRINT, only the DO-CRIME matrix exists.
         measured = calibration if estimate is None else measured_calibration(calibration)
-        parents = {}
+        parents = []
         if measured is not None:
             source = product_key(f"docrime {column}")
-            parents = {source: add_calibration(folder, record, source, measured)}
+            parents = [add_result(folder, record, source, measured)]
             labels[source] = {"label": f"DO-CRIME {column}"}
         if estimate is None:
             continue
         name = product_key(f"escape {column}")
-        add_calibration(folder, record, name, calibration, parents)
+        add_result(folder, record, name, calibration, *parents)
         labels[name] = {"label": f"ESCAPE {column}", "measured": f"DO-CRIME {column}", "column": column}
         checks.append(criteria.sprint_converged(column, estimate))
         estimates[column] = estimate
@@ -157,16 +149,14 @@ def save_table1(
             checks.append(criteria.injected_value_recovered(column, estimate, record.injected))
     if len(estimates) == 2:
         checks += criteria.short_and_long_agree(*estimates.values())
-    document = {
-        **record.header_fields("reproduce table1"),
-        "title": f"Registration from short and long runs: {record.system}",
-        "table1": {k: documents.calibration_document(v) for k, v in result.calibrations.items()},
-        "criteria": [] if result.partial else checks,
-        "labels": labels,
-        "partial": result.partial,
-        **record.footer_fields(wall_seconds),
-    }
-    return write_run_result(folder, document)
+    return save_run(
+        folder, record, "reproduce table1",
+        f"Registration from short and long runs: {record.system}", wall_seconds,
+        table1={k: documents.calibration_document(v) for k, v in result.calibrations.items()},
+        criteria=[] if result.partial else checks,
+        labels=labels,
+        partial=result.partial,
+    )  # fmt: skip
 
 
 # ---------------------------------------------------------------- the cases

@@ -10,13 +10,12 @@ from escape_hw.api.representation import short_repr
 from escape_hw.api.results import CalibrationResult
 from escape_hw.bench import Bench
 from escape_hw.errors import Aborted, CalibrationError
-from escape_hw.runtime.procedures.calibration import calibrate_with_method
+from escape_hw.runtime.procedures.calibration import calibrate_with_method, measured_calibration
 from escape_hw.runtime.procedures.calibration_comparison import (
     CalibrationComparison,
     close_loop_at_best_gain,
     measure_matrices,
     measure_optical_gains,
-    measured_calibration,
     with_and_without_optical_gains,
 )
 from escape_hw.runtime.procedures.model_psf import model_psf

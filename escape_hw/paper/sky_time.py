@@ -239,7 +239,7 @@ def sky_time(
                     f"a process of the campaign died (killed, or out of memory) after {len(done)} of "
                     f"{realisations} realisations; try fewer processes than {workers}"
                 )
-            if note or report.due():
+            if note or report.is_due():
                 # Also when a process died: a Ctrl-C that ended it is raised here.
                 yield report(len(done))
     except Aborted:

@@ -27,15 +27,7 @@ class _Timespec(ctypes.Structure):
 
 
 def futex_address(memory: mmap.mmap, word: int) -> int:
-    """Address of the low half of a 64-bit counter.
-
-    Parameters
-    ----------
-    memory
-        Shared memory.
-    word
-        Offset of the counter, in words.
-    """
+    """Address of the low half of a 64-bit counter at an offset in words of eight bytes."""
     start = np.frombuffer(memory, np.uint8, 1).ctypes.data
     return start + 8 * word + (0 if sys.byteorder == "little" else 4)
 
@@ -44,15 +36,6 @@ def futex_wait(address: int, value: int, timeout_s: float) -> None:
     """Sleep until :func:`futex_wake` is called for a 32-bit word, unless it differs from ``value``.
 
     May return spuriously. Releases the interpreter lock.
-
-    Parameters
-    ----------
-    address
-        Address of the word, in shared memory.
-    value
-        Value that the caller has read.
-    timeout_s
-        Longest sleep.
     """
     if _syscall is None:
         time.sleep(min(_POLL_S, timeout_s))
@@ -65,10 +48,7 @@ def futex_wait(address: int, value: int, timeout_s: float) -> None:
 def futex_wake(address: int) -> None:
     """Wake all processes that wait on a word; takes about a microsecond.
 
-    Raises
-    ------
-    OSError
-        The address is not in shared memory.
+    Raises ``OSError`` if the address is not in shared memory.
     """
     if _syscall is not None and _syscall(_NUMBER, ctypes.c_void_p(address), _WAKE, _ALL, None, None, 0) < 0:
         error = ctypes.get_errno()

@@ -7,9 +7,6 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-import numpy as np
-from numpy.typing import NDArray
-
 from escape_hw.streams import segments
 from escape_hw.streams.ring import RingReader, RingStats
 from escape_hw.streams.segments import Segment, StreamUnavailable
@@ -70,18 +67,12 @@ class StreamMonitor:
         self._previous[one.name] = stats
         age = (time.monotonic_ns() - stats.arrived_ns) * 1e-9 if stats.written else math.nan
         rate = math.nan if before is None else _rate(before, stats)
-        return StreamStatus(
-            *common, stats.written, stats.shape, stats.dtype, rate, age,
-            _interval_percentiles(stats.intervals - (stats if before is None else before).intervals),
-        )  # fmt: skip
+        intervals = stats.intervals - (stats if before is None else before).intervals
+        p50, p99, largest = (percentiles_of(intervals, [50, 99, 100]) / 1e3).tolist()
+        return StreamStatus(*common, stats.written, stats.shape, stats.dtype, rate, age, (p50, p99, largest))
 
 
 def _rate(before: RingStats, now: RingStats) -> float:
     """Entries per second by the entries' own times, since this process may be delayed."""
     entries, elapsed_ns = now.written - before.written, now.arrived_ns - before.arrived_ns
     return 1e9 * entries / elapsed_ns if entries and elapsed_ns > 0 else 0.0
-
-
-def _interval_percentiles(counts: NDArray[np.uint64]) -> tuple[float, float, float]:
-    p50, p99, largest = (percentiles_of(counts, [50, 99, 100]) / 1e3).tolist()
-    return p50, p99, largest

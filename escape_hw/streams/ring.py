@@ -8,7 +8,6 @@ import os
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
-from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
@@ -74,12 +73,7 @@ class RingStats:
 
 
 class RingReader:
-    """Reader of a stream.
-
-    Parameters
-    ----------
-    name
-        Name of the segment.
+    """Reader of the stream in a segment.
 
     Attributes
     ----------
@@ -88,7 +82,7 @@ class RingReader:
 
     Raises
     ------
-    StreamGone
+    StreamUnavailable
         The ring does not exist.
     """
 
@@ -123,13 +117,9 @@ class RingReader:
         return not self.closed and is_alive(self.pid, self._started)
 
     def latest(self, after: int = -1) -> Sample | None:
-        """The newest entry; ``None`` when there is no new one.
+        """The newest entry; ``None`` if it is the one with the index ``after``, which the caller has.
 
-        Parameters
-        ----------
-        after
-            Index of the entry that the caller has. A smaller index counts as newer as well, since indices
-            start again after a restart of the camera.
+        A smaller index counts as newer as well, since indices start again after a restart of the camera.
         """
         for _ in range(_TRIES):
             count = self.written
@@ -166,20 +156,7 @@ class RingReader:
         return None
 
     def wait(self, after: int, timeout_s: float) -> bool:
-        """Wait until an entry is written.
-
-        Parameters
-        ----------
-        after
-            Value of :attr:`written` that the caller has read.
-        timeout_s
-            Longest wait.
-
-        Returns
-        -------
-        bool
-            Whether there is a new entry; false after the time-out or when the ring was closed.
-        """
+        """Wait until :attr:`written` differs from ``after``; false after the time-out or at its end."""
         until = time.monotonic() + timeout_s
         while self.written == after and not self.closed:
             left = until - time.monotonic()
@@ -224,9 +201,7 @@ class RingReader:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *exception: object) -> None:
         self.close()
 
     def _at(self, number: int) -> int:
@@ -351,7 +326,7 @@ class RingWriter:
         ------
         ValueError
             The array or the metadata does not fit; nothing is written.
-        StreamGone
+        StreamUnavailable
             The ring is closed.
         """
         number = self._count
@@ -416,7 +391,5 @@ class RingWriter:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *exception: object) -> None:
         self.close()

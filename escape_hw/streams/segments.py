@@ -120,7 +120,7 @@ def attach(name: str) -> mmap.mmap:
 
     Raises
     ------
-    StreamGone
+    StreamUnavailable
         It does not exist, belongs to another user, has another version, or is no segment.
     """
     path = SHARED / name

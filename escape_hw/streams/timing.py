@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from array import array
-from collections.abc import MutableSequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -55,16 +54,10 @@ def percentiles_of(counts: ArrayLike, shares: ArrayLike) -> NDArray[np.float64]:
 
 
 class Histogram:
-    """Histogram of durations with logarithmic bins.
+    """Histogram of durations with logarithmic bins."""
 
-    Parameters
-    ----------
-    counts
-        Storage, :data:`BINS` 64-bit integers; allocated by default.
-    """
-
-    def __init__(self, counts: MutableSequence[int] | None = None) -> None:
-        self.counts: MutableSequence[int] = array("Q", bytes(8 * BINS)) if counts is None else counts
+    def __init__(self) -> None:
+        self.counts = array("Q", bytes(8 * BINS))
         self.largest = 0
         self.total = 0
 

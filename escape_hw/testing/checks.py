@@ -1,9 +1,10 @@
-"""Type of a contract check, and helper functions for checks."""
+"""Declaration of contract checks, and helper functions for checks."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import wraps
 from typing import Any, Protocol, TypeVar, cast
 
 from escape_hw.api.device import Device
@@ -38,29 +39,34 @@ class Check(Protocol):
         """Run the check on devices from ``factory``."""
 
 
-def check(level: int) -> Callable[[Callable[[Factory], None]], Check]:
-    """Decorate a function as a check of the given level."""
+#: The checks by class of device, without those of its base classes.
+CHECKS: dict[type, list[Check]] = {}
+
+
+def factory_check(kind: type, level: int) -> Callable[[Callable[[Factory], None]], Check]:
+    """Decorate a function of a factory as a check of devices of a class."""
 
     def decorate(function: Callable[[Factory], None]) -> Check:
         decorated = cast(Check, function)
         decorated.level = level
+        CHECKS.setdefault(kind, []).append(decorated)
         return decorated
 
     return decorate
 
 
-def checks_in(namespace: Mapping[str, object]) -> tuple[Check, ...]:
-    """The checks defined in a module so far, in order; ``namespace`` is its ``globals()``."""
-    return tuple(
-        cast(Check, one)
-        for name, one in namespace.items()
-        if name.startswith("check_") and getattr(one, "__module__", "") == namespace["__name__"]
-    )
+def check(kind: type, level: int) -> Callable[[Callable[[Any], None]], Check]:
+    """Decorate a function of an open device as a check of devices of a class."""
 
+    def decorate(function: Callable[[Any], None]) -> Check:
+        @wraps(function)
+        def open_and_check(factory: Factory) -> None:
+            with open_device(factory) as device:
+                function(device)
 
-def checks_up_to(checks: tuple[Check, ...], max_level: int) -> list[Check]:
-    """The checks up to a level."""
-    return [one for one in checks if one.level <= max_level]
+        return factory_check(kind, level)(open_and_check)
+
+    return decorate
 
 
 def assert_refused(device: Device, error: type[E], why: str, call: Callable[..., object], *args: object) -> E:
@@ -79,6 +85,13 @@ def assert_refused(device: Device, error: type[E], why: str, call: Callable[...,
             f"{why}: expected {error.__name__}, got {type(other).__name__}: {other}"
         ) from other
     raise AssertionError(f"{why}: expected {error.__name__}, but it was accepted and returned {answer!r}")
+
+
+def assert_identified(info: Any, kind: type[Any]) -> None:
+    """Require the identity of a device that products need: class of ``info``, model, ``simulated``."""
+    assert isinstance(info, kind), f"info is {type(info).__name__}, not {kind.__name__}"
+    assert info.model.strip(), "info.model is empty; products need it"
+    assert type(info.simulated) is bool, f"info.simulated is {info.simulated!r}, neither true nor false"
 
 
 @contextmanager

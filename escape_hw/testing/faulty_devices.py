@@ -4,16 +4,42 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from escape_hw.api.camera import Camera, CameraInfo, CameraSettings, Frame
-from escape_hw.api.mirror import DeformableMirror, DMInfo
+from escape_hw.api.camera import Camera, CameraSettings, Frame
+from escape_hw.api.device import Device
+from escape_hw.api.mirror import DeformableMirror
 from escape_hw.errors import DeviceError, DeviceLost, FrameTimeout
 
 
-class FaultyMirror(DeformableMirror):
+class _Wrapper(Device):
+    """Identity, clock and connection of the wrapped device, a mix-in placed before its interface."""
+
+    inner: Any
+
+    @property
+    def info(self) -> Any:
+        """Identity of the inner device."""
+        return self.inner.info
+
+    def now_ns(self) -> int:
+        """Clock of the inner device."""
+        return int(self.inner.now_ns())
+
+    def _open(self) -> None:
+        self.inner.open()
+
+    def _close(self) -> None:
+        self.inner.close()
+
+    def _release_after_failed_open(self) -> None:
+        self.inner.close()
+
+
+class FaultyMirror(_Wrapper, DeformableMirror):
     """A wrapper of a mirror that records transfers and injects faults.
 
     Without faults it satisfies the contract of a mirror.
@@ -42,31 +68,16 @@ class FaultyMirror(DeformableMirror):
         lost_from: int | None = None,
     ) -> None:
         super().__init__(inner.name, inner.limits)
-        self.inner = inner
+        self.inner: DeformableMirror = inner
         self.fail_sends = frozenset(fail_sends)
         self.lost_from = lost_from
         self.reached: list[NDArray[np.float64]] = []
         self.transfers = 0
 
-    @property
-    def info(self) -> DMInfo:
-        """Identity and geometry of the inner mirror."""
-        return self.inner.info
-
-    def now_ns(self) -> int:
-        """The inner mirror's clock."""
-        return self.inner.now_ns()
-
     def _open(self) -> None:
-        self.inner.open()
+        super()._open()
         if self._flat is None:
             self._flat = self.inner.flat
-
-    def _close(self) -> None:
-        self.inner.close()
-
-    def _release_after_failed_open(self) -> None:
-        self.inner.close()
 
     def _present_shape(self) -> NDArray[np.float64]:
         return self.inner.shape
@@ -83,7 +94,7 @@ class FaultyMirror(DeformableMirror):
         return report.sent if report.skipped else None
 
 
-class FaultyCamera(Camera):
+class FaultyCamera(_Wrapper, Camera):
     """A wrapper of a camera that drops, repeats and withholds frames.
 
     Without faults it satisfies the contract of a camera. Faults refer to frame indices of the inner camera.
@@ -118,7 +129,7 @@ class FaultyCamera(Camera):
         super().__init__(inner.name)
         if drop_every is not None and drop_every < 2:
             raise ValueError(f"drop_every is {drop_every}; it must be at least 2")
-        self.inner = inner
+        self.inner: Camera = inner
         self.drop = frozenset(drop)
         self.drop_every = drop_every
         self.repeat = frozenset(repeat)
@@ -127,27 +138,9 @@ class FaultyCamera(Camera):
         self._repeated: Frame | None = None
 
     @property
-    def info(self) -> CameraInfo:
-        """Identity of the inner camera."""
-        return self.inner.info
-
-    @property
     def settings(self) -> CameraSettings:
         """Settings of the inner camera."""
         return self.inner.settings
-
-    def now_ns(self) -> int:
-        """The inner camera's clock."""
-        return self.inner.now_ns()
-
-    def _open(self) -> None:
-        self.inner.open()
-
-    def _close(self) -> None:
-        self.inner.close()
-
-    def _release_after_failed_open(self) -> None:
-        self.inner.close()
 
     def _check(self, want: CameraSettings) -> CameraSettings:
         return self.inner.check(want)

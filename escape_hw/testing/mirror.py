@@ -14,20 +14,7 @@ from numpy.typing import NDArray
 from escape_hw.api.mirror import DeformableMirror, DMInfo
 from escape_hw.errors import CommandRejected, DeviceError, DeviceLost
 from escape_hw.safety.limits import MirrorLimits, nearest_pairs, neighbour_pairs
-from escape_hw.testing.checks import (
-    FULL,
-    READS,
-    TINY,
-    Check,
-    Factory,
-    assert_refused,
-    check,
-    checks_in,
-    checks_up_to,
-    open_device,
-    replace_hook,
-)
-from escape_hw.testing.device import COMMON_CHECKS
+from escape_hw.testing.checks import FULL, READS, TINY, assert_identified, assert_refused, check, replace_hook
 
 #: Tolerance for rounding, fraction of full stroke.
 ROUNDING = 1e-9
@@ -90,58 +77,53 @@ def limit_violations(
     return found
 
 
-@check(FULL)
-def check_mirror_obeys_its_limits(factory: Factory) -> None:
+@check(DeformableMirror, FULL)
+def check_mirror_obeys_its_limits(dm: DeformableMirror) -> None:
     """Every command that reaches the device obeys every limit."""
     rng = np.random.default_rng(1)
-    with open_device(factory) as dm:
-        n, start = dm.info.n_act, dm.shape
-        wild = [size * rng.standard_normal(n) for size in (0.01, 0.3, 1.0, 10.0, 1e300) for _ in range(8)]
-        level = [np.full(n, value) for value in (5.0, -5.0, 1.0, -1e308)]
-        checkers = [np.where(np.arange(n) % 2, value, -value) for value in (1.0, -2.0)]
-        with record_transfers(dm) as reached:
-            for command in (*wild, *level, *checkers):
-                report = dm.send(command)
-                assert np.array_equal(reached[-1], report.sent), "report.sent is not what reached the device"
-        for before, after in pairwise([start, *reached]):
-            broken = limit_violations(dm, before, after)
-            assert not broken, f"a command that reached the device violates its limits: {'; '.join(broken)}"
+    n, start = dm.info.n_act, dm.shape
+    wild = [size * rng.standard_normal(n) for size in (0.01, 0.3, 1.0, 10.0, 1e300) for _ in range(8)]
+    level = [np.full(n, value) for value in (5.0, -5.0, 1.0, -1e308)]
+    checkers = [np.where(np.arange(n) % 2, value, -value) for value in (1.0, -2.0)]
+    with record_transfers(dm) as reached:
+        for command in (*wild, *level, *checkers):
+            report = dm.send(command)
+            assert np.array_equal(reached[-1], report.sent), "report.sent is not what reached the device"
+    for before, after in pairwise([start, *reached]):
+        broken = limit_violations(dm, before, after)
+        assert not broken, f"a command that reached the device violates its limits: {'; '.join(broken)}"
 
 
-@check(FULL)
-def check_mirror_reports_clipping(factory: Factory) -> None:
+@check(DeformableMirror, FULL)
+def check_mirror_reports_clipping(dm: DeformableMirror) -> None:
     """A command beyond the stroke is clipped, reported and counted."""
-    with open_device(factory) as dm:
-        dm.flatten()
-        command = np.zeros(dm.info.n_act)
-        poked = int(np.flatnonzero(small_poke(dm) != dm.flat)[0])
-        command[poked] = 5.0
-        report = dm.send(command)
-        assert report.guard.clipped == 1, (
-            f"one actuator exceeded the stroke, but the report is {report.guard}"
-        )
-        assert not report.guard.is_unchanged, "report.guard.is_unchanged is true for a clipped command"
-        assert dm.clipped_count == 1, f"clipped_count is {dm.clipped_count} after one clipped actuator"
+    dm.flatten()
+    command = np.zeros(dm.info.n_act)
+    poked = int(np.flatnonzero(small_poke(dm) != dm.flat)[0])
+    command[poked] = 5.0
+    report = dm.send(command)
+    assert report.guard.clipped == 1, f"one actuator exceeded the stroke, but the report is {report.guard}"
+    assert not report.guard.is_unchanged, "report.guard.is_unchanged is true for a clipped command"
+    assert dm.clipped_count == 1, f"clipped_count is {dm.clipped_count} after one clipped actuator"
 
 
-@check(TINY)
-def check_mirror_failed_transfer_keeps_shape(factory: Factory) -> None:
+@check(DeformableMirror, TINY)
+def check_mirror_failed_transfer_keeps_shape(dm: DeformableMirror) -> None:
     """A failed transfer raises and keeps the last shape."""
-    with open_device(factory) as dm:
-        dm.flatten()
-        shape, sent, command = dm.shape, dm.sent_count, small_poke(dm)
-        with replace_hook(dm, "_send", _failing_transfer(dm)):
-            assert_refused(dm, DeviceLost, "a transfer that fails", dm.send, command)
-            assert np.array_equal(dm.shape, shape), "the transfer failed, but the shape changed"
-            assert dm.sent_count == sent, "the transfer failed, but sent_count increased"
-        dm.send(command)
-        assert np.array_equal(dm.shape, command), "a command after a failed transfer was not sent"
+    dm.flatten()
+    shape, sent, command = dm.shape, dm.sent_count, small_poke(dm)
+    with replace_hook(dm, "_send", _failing_transfer(dm)):
+        assert_refused(dm, DeviceLost, "a transfer that fails", dm.send, command)
+        assert np.array_equal(dm.shape, shape), "the transfer failed, but the shape changed"
+        assert dm.sent_count == sent, "the transfer failed, but sent_count increased"
+    dm.send(command)
+    assert np.array_equal(dm.shape, command), "a command after a failed transfer was not sent"
 
 
-@check(TINY)
-def check_mirror_flattens(factory: Factory) -> None:
+@check(DeformableMirror, TINY)
+def check_mirror_flattens(dm: DeformableMirror) -> None:
     """``flatten`` works just after ``open``, after a poke and after a rejected command."""
-    with open_device(factory) as dm, record_transfers(dm) as reached:
+    with record_transfers(dm) as reached:
         dm.flatten()
         known = dm._present_shape() is not None
         assert reached or known, "flatten() after open() sent nothing, although the shape is unknown"
@@ -156,76 +138,72 @@ def check_mirror_flattens(factory: Factory) -> None:
             assert np.array_equal(dm.shape, dm.flat), "shape is not flat after flatten()"
 
 
-@check(TINY)
-def check_mirror_flat_can_be_set(factory: Factory) -> None:
+@check(DeformableMirror, TINY)
+def check_mirror_flat_can_be_set(dm: DeformableMirror) -> None:
     """A legal flat command is stored and reached; an illegal one is rejected."""
-    with open_device(factory) as dm:
-        dm.flatten()
-        chosen = small_poke(dm)
-        dm.set_flat(chosen)
-        too_far = np.full(dm.info.n_act, 1.5)
-        for what, command in (("NaN", np.full(dm.info.n_act, np.nan)), ("1.5 full strokes", too_far)):
-            assert_refused(dm, CommandRejected, f"a flat of {what}", dm.set_flat, command)
-        assert np.array_equal(dm.flat, chosen), "flat differs from the argument of set_flat()"
-        assert not np.array_equal(dm.shape, chosen), "set_flat() moved the mirror"
-        dm.flatten()
-        assert np.array_equal(dm.shape, chosen), "flatten() did not go to the command of set_flat()"
+    dm.flatten()
+    chosen = small_poke(dm)
+    dm.set_flat(chosen)
+    too_far = np.full(dm.info.n_act, 1.5)
+    for what, command in (("NaN", np.full(dm.info.n_act, np.nan)), ("1.5 full strokes", too_far)):
+        assert_refused(dm, CommandRejected, f"a flat of {what}", dm.set_flat, command)
+    assert np.array_equal(dm.flat, chosen), "flat differs from the argument of set_flat()"
+    assert not np.array_equal(dm.shape, chosen), "set_flat() moved the mirror"
+    dm.flatten()
+    assert np.array_equal(dm.shape, chosen), "flatten() did not go to the command of set_flat()"
 
 
-@check(FULL)
-def check_mirror_ramps_to_flat(factory: Factory) -> None:
+@check(DeformableMirror, FULL)
+def check_mirror_ramps_to_flat(dm: DeformableMirror) -> None:
     """``flatten`` returns from the end of the range in small, legal steps."""
-    with open_device(factory) as dm:
-        small_poke(dm)  # skips when no actuator may move
-        shape = _drive_to_limit(dm)
-        with record_transfers(dm) as reached:
-            dm.flatten()
-            assert np.array_equal(reached[-1], dm.flat), "flatten() did not end at flat"
-            for before, after in pairwise([shape, *reached]):
-                step = float(np.abs(after - before).max())
-                assert step <= dm.RAMP_STEP + ROUNDING, (
-                    f"flatten() jumped by {step:.3g} of full stroke; RAMP_STEP is {dm.RAMP_STEP}"
-                )
-                broken = limit_violations(dm, before, after)
-                assert not broken, f"flatten() violated the limits: {'; '.join(broken)}"
-
-
-@check(TINY)
-def check_mirror_is_flat_when_closed(factory: Factory) -> None:
-    """The last command before disconnection is flat."""
-    with open_device(factory) as dm:
-        dm.send(small_poke(dm))
-        flat = dm.flat
-        with record_transfers(dm) as reached:
-            disconnect, state_at_close = dm._close, []
-
-            def record_and_close() -> None:
-                state_at_close.extend(reached[-1:])
-                disconnect()
-
-            with replace_hook(dm, "_close", record_and_close):
-                dm.close()
-        assert state_at_close, "close() sent nothing; the mirror is still poked"
-        assert np.array_equal(state_at_close[0], flat), "the mirror was not flat at disconnection"
-
-
-@check(TINY)
-def check_mirror_closes_when_lost(factory: Factory) -> None:
-    """A mirror that cannot be flattened is closed, and the cause is raised."""
-    with open_device(factory) as dm:
-        dm.send(small_poke(dm))
-        with replace_hook(dm, "_send", _failing_transfer(dm)):
-            assert_refused(dm, DeviceLost, "close() of a mirror that was lost", dm.close)
-        assert not dm.is_open, "still open after close()"
-        dm.open()
+    small_poke(dm)  # skips when no actuator may move
+    shape = _drive_to_limit(dm)
+    with record_transfers(dm) as reached:
         dm.flatten()
-        assert np.array_equal(dm.shape, dm.flat), "the mirror cannot be used again after reopening"
-        dm.send(small_poke(dm))
-        try:
-            with replace_hook(dm, "_send", _failing_transfer(dm)), dm:
-                raise DeviceError(dm.name, "the first cause")
-        except DeviceError as error:
-            assert "the first cause" in str(error), f"close() replaced the first exception by: {error}"
+        assert np.array_equal(reached[-1], dm.flat), "flatten() did not end at flat"
+        for before, after in pairwise([shape, *reached]):
+            step = float(np.abs(after - before).max())
+            assert step <= dm.RAMP_STEP + ROUNDING, (
+                f"flatten() jumped by {step:.3g} of full stroke; RAMP_STEP is {dm.RAMP_STEP}"
+            )
+            broken = limit_violations(dm, before, after)
+            assert not broken, f"flatten() violated the limits: {'; '.join(broken)}"
+
+
+@check(DeformableMirror, TINY)
+def check_mirror_is_flat_when_closed(dm: DeformableMirror) -> None:
+    """The last command before disconnection is flat."""
+    dm.send(small_poke(dm))
+    flat = dm.flat
+    with record_transfers(dm) as reached:
+        disconnect, state_at_close = dm._close, []
+
+        def record_and_close() -> None:
+            state_at_close.extend(reached[-1:])
+            disconnect()
+
+        with replace_hook(dm, "_close", record_and_close):
+            dm.close()
+    assert state_at_close, "close() sent nothing; the mirror is still poked"
+    assert np.array_equal(state_at_close[0], flat), "the mirror was not flat at disconnection"
+
+
+@check(DeformableMirror, TINY)
+def check_mirror_closes_when_lost(dm: DeformableMirror) -> None:
+    """A mirror that cannot be flattened is closed, and the cause is raised."""
+    dm.send(small_poke(dm))
+    with replace_hook(dm, "_send", _failing_transfer(dm)):
+        assert_refused(dm, DeviceLost, "close() of a mirror that was lost", dm.close)
+    assert not dm.is_open, "still open after close()"
+    dm.open()
+    dm.flatten()
+    assert np.array_equal(dm.shape, dm.flat), "the mirror cannot be used again after reopening"
+    dm.send(small_poke(dm))
+    try:
+        with replace_hook(dm, "_send", _failing_transfer(dm)), dm:
+            raise DeviceError(dm.name, "the first cause")
+    except DeviceError as error:
+        assert "the first cause" in str(error), f"close() replaced the first exception by: {error}"
 
 
 def _failing_transfer(dm: DeformableMirror) -> Callable[[NDArray[np.float64]], None]:
@@ -246,19 +224,16 @@ def _drive_to_limit(dm: DeformableMirror) -> NDArray[np.float64]:
     return dm.shape
 
 
-@check(READS)
-def check_mirror_info_is_complete(factory: Factory) -> None:
+@check(DeformableMirror, READS)
+def check_mirror_info_is_complete(dm: DeformableMirror) -> None:
     """Identity and geometry are complete and consistent."""
-    with open_device(factory) as dm:
-        info = dm.info
-        assert isinstance(info, DMInfo), f"info is {type(info).__name__}, not DMInfo"
-        assert info.model, "info.model is empty"
-        assert info.serial, "info.serial is empty; products need it"
-        assert isinstance(info.simulated, bool), f"info.simulated is {info.simulated!r}, not a bool"
-        assert info.n_act >= 1, f"info.n_act is {info.n_act}"
-        assert 0 < info.stroke_m < 1, f"info.stroke_m is {info.stroke_m}; the unit is metres of surface"
-        assert isinstance(dm.limits, MirrorLimits), f"limits is {type(dm.limits).__name__}"
-        _require_geometry(info)
+    info = dm.info
+    assert_identified(info, DMInfo)
+    assert info.serial, "info.serial is empty; products need it"
+    assert info.n_act >= 1, f"info.n_act is {info.n_act}"
+    assert 0 < info.stroke_m < 1, f"info.stroke_m is {info.stroke_m}; the unit is metres of surface"
+    assert isinstance(dm.limits, MirrorLimits), f"limits is {type(dm.limits).__name__}"
+    _require_geometry(info)
 
 
 def _require_geometry(info: DMInfo) -> None:
@@ -281,46 +256,41 @@ def _require_geometry(info: DMInfo) -> None:
         assert ordered, f"{name} of positions_m does not increase along the layout; is it row-major?"
 
 
-@check(READS)
-def check_mirror_refuses_not_finite(factory: Factory) -> None:
+@check(DeformableMirror, READS)
+def check_mirror_refuses_not_finite(dm: DeformableMirror) -> None:
     """A command with a NaN or infinity is rejected, and the message gives its index."""
-    with open_device(factory) as dm:
-        n_act = dm.info.n_act
-        for value, index in ((np.nan, n_act - 1), (np.inf, 0), (-np.inf, n_act // 2)):
-            command = np.zeros(n_act)
-            command[index] = value
-            refusal = _assert_rejected(dm, command, f"a command with {value} at actuator {index}")
-            assert f"actuator {index} " in f"{refusal} ", (
-                f"the message does not give index {index}: {refusal}"
-            )
+    n_act = dm.info.n_act
+    for value, index in ((np.nan, n_act - 1), (np.inf, 0), (-np.inf, n_act // 2)):
+        command = np.zeros(n_act)
+        command[index] = value
+        refusal = _assert_rejected(dm, command, f"a command with {value} at actuator {index}")
+        assert f"actuator {index} " in f"{refusal} ", f"the message does not give index {index}: {refusal}"
 
 
-@check(READS)
-def check_mirror_refuses_wrong_shape(factory: Factory) -> None:
+@check(DeformableMirror, READS)
+def check_mirror_refuses_wrong_shape(dm: DeformableMirror) -> None:
     """A command of any shape but ``(n_act,)`` is rejected."""
-    with open_device(factory) as dm:
-        n = dm.info.n_act
-        for shape in ((n + 1,), (n - 1,), (n, 1), (1, n), (0,), ()):
-            _assert_rejected(dm, np.zeros(shape), f"a command of shape {shape}")
+    n = dm.info.n_act
+    for shape in ((n + 1,), (n - 1,), (n, 1), (1, n), (0,), ()):
+        _assert_rejected(dm, np.zeros(shape), f"a command of shape {shape}")
 
 
-@check(READS)
-def check_mirror_refuses_wrong_type(factory: Factory) -> None:
+@check(DeformableMirror, READS)
+def check_mirror_refuses_wrong_type(dm: DeformableMirror) -> None:
     """Anything but real numbers raises ``CommandRejected``, not an exception of numpy."""
-    with open_device(factory) as dm:
-        n = dm.info.n_act
-        wrong: dict[str, Any] = {
-            "bool": np.zeros(n, dtype=bool),
-            "complex": np.zeros(n, dtype=complex),
-            "object": np.array([0.0] * n, dtype=object),
-            "text": np.array(["0"] * n),
-            "ragged": [[0.0, 0.0], [0.0], *([0.0] for _ in range(n - 2))],
-            "None": None,
-            "dictionary": {"command": 0.0},
-            "masked": np.ma.masked_array(np.zeros(n), mask=True),
-        }
-        for kind, command in wrong.items():
-            _assert_rejected(dm, command, f"a command of kind {kind}")
+    n = dm.info.n_act
+    wrong: dict[str, Any] = {
+        "bool": np.zeros(n, dtype=bool),
+        "complex": np.zeros(n, dtype=complex),
+        "object": np.array([0.0] * n, dtype=object),
+        "text": np.array(["0"] * n),
+        "ragged": [[0.0, 0.0], [0.0], *([0.0] for _ in range(n - 2))],
+        "None": None,
+        "dictionary": {"command": 0.0},
+        "masked": np.ma.masked_array(np.zeros(n), mask=True),
+    }
+    for kind, command in wrong.items():
+        _assert_rejected(dm, command, f"a command of kind {kind}")
 
 
 def _assert_rejected(dm: DeformableMirror, command: Any, what: str) -> CommandRejected:
@@ -335,90 +305,77 @@ def _assert_rejected(dm: DeformableMirror, command: Any, what: str) -> CommandRe
     return refusal
 
 
-@check(TINY)
-def check_mirror_sends_legal_commands_unchanged(factory: Factory) -> None:
+@check(DeformableMirror, TINY)
+def check_mirror_sends_legal_commands_unchanged(dm: DeformableMirror) -> None:
     """A legal command is sent unchanged."""
-    with open_device(factory) as dm:
-        dm.flatten()
-        command = small_poke(dm)
-        report = dm.send(command)
-        assert report.guard.is_unchanged, f"a legal command was changed: {report.guard}"
-        assert np.array_equal(report.sent, command), "report.sent differs from the command"
-        assert np.array_equal(dm.shape, command), "shape differs from the command"
+    dm.flatten()
+    command = small_poke(dm)
+    report = dm.send(command)
+    assert report.guard.is_unchanged, f"a legal command was changed: {report.guard}"
+    assert np.array_equal(report.sent, command), "report.sent differs from the command"
+    assert np.array_equal(dm.shape, command), "shape differs from the command"
 
 
-@check(TINY)
-def check_mirror_takes_any_real_array(factory: Factory) -> None:
+@check(DeformableMirror, TINY)
+def check_mirror_takes_any_real_array(dm: DeformableMirror) -> None:
     """Lists, float32, integers, strided and read-only arrays are accepted."""
-    with open_device(factory) as dm:
-        dm.flatten()
-        plain = small_poke(dm)
-        strided = np.repeat(plain, 2)[::2]
-        read_only = plain.copy()
-        read_only.setflags(write=False)
-        single = plain.astype(np.float32)
-        kinds: dict[str, tuple[Any, NDArray[np.float64]]] = {
-            "strided": (strided, plain),
-            "read-only": (read_only, plain),
-            "list": (plain.tolist(), plain),
-            "float32": (single, single.astype(np.float64)),
-            "big-endian": (plain.astype(">f8"), plain),
-            "integers": (np.zeros(plain.size, dtype=np.int8), np.zeros(plain.size)),
-        }
-        for kind, (command, expected) in kinds.items():
-            sent = dm.send(command).sent
-            assert sent.dtype == np.float64, f"{kind}: sent as {sent.dtype}, not float64"
-            if dm.limits.max_slew is None:
-                assert np.array_equal(sent, expected), f"{kind}: another command was sent"
+    dm.flatten()
+    plain = small_poke(dm)
+    strided = np.repeat(plain, 2)[::2]
+    read_only = plain.copy()
+    read_only.setflags(write=False)
+    single = plain.astype(np.float32)
+    kinds: dict[str, tuple[Any, NDArray[np.float64]]] = {
+        "strided": (strided, plain),
+        "read-only": (read_only, plain),
+        "list": (plain.tolist(), plain),
+        "float32": (single, single.astype(np.float64)),
+        "big-endian": (plain.astype(">f8"), plain),
+        "integers": (np.zeros(plain.size, dtype=np.int8), np.zeros(plain.size)),
+    }
+    for kind, (command, expected) in kinds.items():
+        sent = dm.send(command).sent
+        assert sent.dtype == np.float64, f"{kind}: sent as {sent.dtype}, not float64"
+        if dm.limits.max_slew is None:
+            assert np.array_equal(sent, expected), f"{kind}: another command was sent"
 
 
-@check(TINY)
-def check_mirror_shares_no_memory(factory: Factory) -> None:
+@check(DeformableMirror, TINY)
+def check_mirror_shares_no_memory(dm: DeformableMirror) -> None:
     """Arrays of the caller and returned arrays share no memory with the mirror."""
-    with open_device(factory) as dm:
-        dm.flatten()
-        command = small_poke(dm)
-        kept = command.copy()
-        report = dm.send(command)
-        assert np.array_equal(command, kept), "send() changed the array of the caller"
-        command[:] = 0.5
-        assert np.array_equal(dm.shape, kept), "the mirror stored the array of the caller instead of a copy"
-        assert not report.sent.flags.writeable, "report.sent is writable; the guard relies on it"
-        for name, answer in (("shape", dm.shape), ("flat", dm.flat)):
-            before = answer.copy()
-            answer += 0.25
-            assert np.array_equal(getattr(dm, name), before), f"writing into {name} changed the mirror"
+    dm.flatten()
+    command = small_poke(dm)
+    kept = command.copy()
+    report = dm.send(command)
+    assert np.array_equal(command, kept), "send() changed the array of the caller"
+    command[:] = 0.5
+    assert np.array_equal(dm.shape, kept), "the mirror stored the array of the caller instead of a copy"
+    assert not report.sent.flags.writeable, "report.sent is writable; the guard relies on it"
+    for name, answer in (("shape", dm.shape), ("flat", dm.flat)):
+        before = answer.copy()
+        answer += 0.25
+        assert np.array_equal(getattr(dm, name), before), f"writing into {name} changed the mirror"
 
 
-@check(TINY)
-def check_mirror_counts(factory: Factory) -> None:
+@check(DeformableMirror, TINY)
+def check_mirror_counts(dm: DeformableMirror) -> None:
     """The counters start at ``open`` and count each send once."""
-    with open_device(factory) as dm:
-        counts = (dm.sent_count, dm.clipped_count, dm.rejected_count)
-        assert counts == (0, 0, 0), f"the counters are {counts} after open(), not 0"
-        command = small_poke(dm)
-        for n in range(1, 4):
-            dm.send(command)
-            assert dm.sent_count == n, f"sent_count is {dm.sent_count} after {n} sends"
-        assert dm.clipped_count == 0, f"clipped_count is {dm.clipped_count}, but nothing was clipped"
-        assert dm.rejected_count == 0, f"rejected_count is {dm.rejected_count}, but nothing was rejected"
+    counts = (dm.sent_count, dm.clipped_count, dm.rejected_count)
+    assert counts == (0, 0, 0), f"the counters are {counts} after open(), not 0"
+    command = small_poke(dm)
+    for n in range(1, 4):
+        dm.send(command)
+        assert dm.sent_count == n, f"sent_count is {dm.sent_count} after {n} sends"
+    assert dm.clipped_count == 0, f"clipped_count is {dm.clipped_count}, but nothing was clipped"
+    assert dm.rejected_count == 0, f"rejected_count is {dm.rejected_count}, but nothing was rejected"
 
 
-@check(TINY)
-def check_mirror_times_its_sends(factory: Factory) -> None:
+@check(DeformableMirror, TINY)
+def check_mirror_times_its_sends(dm: DeformableMirror) -> None:
     """``sent_ns`` is on the clock of the mirror."""
-    with open_device(factory) as dm:
-        command = small_poke(dm)
-        for _ in range(3):
-            before = dm.now_ns()
-            sent_ns = dm.send(command).sent_ns
-            after = dm.now_ns()
-            assert before <= sent_ns <= after, f"sent_ns is {sent_ns}, outside {before} to {after} ns"
-
-
-MIRROR_CHECKS = (*COMMON_CHECKS, *checks_in(globals()))
-
-
-def mirror_checks(max_level: int = 3) -> list[Check]:
-    """Checks for a deformable mirror up to a level: 0 at rest, 1 pokes by a percent, 3 full range."""
-    return checks_up_to(MIRROR_CHECKS, max_level)
+    command = small_poke(dm)
+    for _ in range(3):
+        before = dm.now_ns()
+        sent_ns = dm.send(command).sent_ns
+        after = dm.now_ns()
+        assert before <= sent_ns <= after, f"sent_ns is {sent_ns}, outside {before} to {after} ns"

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from escape_hw.api.adaptive_secondary import AdaptiveSecondary, ShellHealth, ShellState
 from escape_hw.api.camera import Camera, CameraInfo, CameraSettings, Frame, Region
+from escape_hw.api.device import Device
 from escape_hw.api.mirror import DeformableMirror, DMInfo
 from escape_hw.api.modulator import Modulation, ModulatorInfo, TipTiltModulator
 from escape_hw.api.phase_screen import PhaseScreen, ScreenInfo, ScreenState
@@ -16,7 +17,17 @@ from escape_hw.errors import FrameTimeout, SettingRejected
 from escape_hw.safety.limits import MirrorLimits
 
 
-class RecordingMirror(DeformableMirror):
+class _NothingToConnect(Device):
+    """Connection of a device without hardware, a mix-in placed before its interface."""
+
+    def _open(self) -> None:
+        pass
+
+    def _close(self) -> None:
+        pass
+
+
+class RecordingMirror(_NothingToConnect, DeformableMirror):
     """A mirror of 21 actuators in a circle (5 x 5 without corners) that records its commands.
 
     Attributes
@@ -38,17 +49,11 @@ class RecordingMirror(DeformableMirror):
         positions_m = np.stack([axis[columns], axis[rows]], axis=1) * np.float64(1.5e-3)
         return DMInfo("recording", "REF-DM", int(layout.sum()), layout, positions_m, 2e-6, simulated=True)
 
-    def _open(self) -> None:
-        pass
-
-    def _close(self) -> None:
-        pass
-
     def _send(self, command: NDArray[np.float64]) -> None:
         self.history.append(command.copy())
 
 
-class IdealSecondary(AdaptiveSecondary):
+class IdealSecondary(_NothingToConnect, AdaptiveSecondary):
     """An adaptive secondary of 21 actuators that reaches every state and shape at once."""
 
     def __init__(self, name: str = "secondary", limits: MirrorLimits | None = None) -> None:
@@ -60,12 +65,6 @@ class IdealSecondary(AdaptiveSecondary):
     def info(self) -> DMInfo:
         """Identity and geometry of :class:`RecordingMirror`."""
         return RecordingMirror().info
-
-    def _open(self) -> None:
-        pass
-
-    def _close(self) -> None:
-        pass
 
     def _send_to_shell(self, command: NDArray[np.float64]) -> None:
         self._last = command
@@ -86,7 +85,7 @@ class IdealSecondary(AdaptiveSecondary):
         return ShellHealth(self.now_ns(), self._current_state, 50e-6, 0.1, 15.0, 0)
 
 
-class SyntheticCamera(Camera):
+class SyntheticCamera(_NothingToConnect, Camera):
     """A camera of 64 x 48 pixels on a simulated clock with a resolution of 1 us."""
 
     _TICK_NS = 1000
@@ -115,12 +114,6 @@ class SyntheticCamera(Camera):
     def _period_ns(self) -> int:
         return round(1e9 / self._settings.frame_rate_hz / self._TICK_NS) * self._TICK_NS
 
-    def _open(self) -> None:
-        pass
-
-    def _close(self) -> None:
-        pass
-
     def _check(self, want: CameraSettings) -> CameraSettings:
         if not 1 <= want.frame_rate_hz <= 2000:
             raise SettingRejected(
@@ -129,12 +122,8 @@ class SyntheticCamera(Camera):
         period_us = round(1e6 / want.frame_rate_hz)
         exposure_us = min(max(1, round(want.exposure_s * 1e6)), period_us)
         region, step = want.region, self._STEP_PX
-        whole = Region(
-            region.x,
-            region.y,
-            max(step, region.width // step * step),
-            max(step, region.height // step * step),
-        )
+        width, height = (max(step, side // step * step) for side in (region.width, region.height))
+        whole = Region(region.x, region.y, width, height)
         rows, columns = self.info.sensor_shape
         if whole.x + whole.width > columns or whole.y + whole.height > rows:
             raise SettingRejected(self.name, f"{region} leaves no {step} x {step} pixels on the sensor")
@@ -164,7 +153,7 @@ class SyntheticCamera(Camera):
         return Frame(data, self._index, due_ns, due_ns, n_saturated)
 
 
-class QuantisedModulator(TipTiltModulator):
+class QuantisedModulator(_NothingToConnect, TipTiltModulator):
     """A stage whose period is a whole number of steps of 50 microseconds."""
 
     STEP_S = 50e-6
@@ -183,12 +172,6 @@ class QuantisedModulator(TipTiltModulator):
         """The modulation in force."""
         return self._modulation
 
-    def _open(self) -> None:
-        pass
-
-    def _close(self) -> None:
-        pass
-
     def _check(self, want: Modulation) -> Modulation:
         steps = round(1 / (want.frequency_hz * self.STEP_S))
         if not 4 <= steps <= 100_000:
@@ -204,7 +187,7 @@ class QuantisedModulator(TipTiltModulator):
         self._modulation = None
 
 
-class IdealPhaseScreen(PhaseScreen):
+class IdealPhaseScreen(_NothingToConnect, PhaseScreen):
     """A changer with four screens that reaches every state at once."""
 
     def __init__(self, name: str = "screen") -> None:
@@ -225,12 +208,6 @@ class IdealPhaseScreen(PhaseScreen):
     def n_screens(self) -> int:
         """Four."""
         return 4
-
-    def _open(self) -> None:
-        pass
-
-    def _close(self) -> None:
-        pass
 
     def _set(self, want: ScreenState) -> None:
         self._state = want

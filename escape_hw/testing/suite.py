@@ -5,6 +5,7 @@ from __future__ import annotations
 import unittest
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING
 
 from escape_hw.api.adaptive_secondary import AdaptiveSecondary
@@ -13,13 +14,9 @@ from escape_hw.api.device import Device
 from escape_hw.api.mirror import DeformableMirror
 from escape_hw.api.modulator import TipTiltModulator
 from escape_hw.api.phase_screen import PhaseScreen
-from escape_hw.testing.adaptive_secondary import secondary_checks
-from escape_hw.testing.camera import camera_checks
-from escape_hw.testing.checks import Check, Factory, checks_up_to
-from escape_hw.testing.device import COMMON_CHECKS
-from escape_hw.testing.mirror import mirror_checks
-from escape_hw.testing.modulator import modulator_checks
-from escape_hw.testing.phase_screen import screen_checks
+from escape_hw.testing import adaptive_secondary, camera, mirror, modulator, phase_screen  # noqa: F401
+from escape_hw.testing import device as any_device  # noqa: F401 - these modules declare the checks
+from escape_hw.testing.checks import CHECKS, Check, Factory
 
 if TYPE_CHECKING:
     import pytest
@@ -36,18 +33,21 @@ class CheckResult:
 
 
 def checks_for(device: Device, max_level: int = 3) -> list[Check]:
-    """Every check for the kind of a device, up to a level."""
-    if isinstance(device, AdaptiveSecondary):
-        return secondary_checks(max_level)
-    if isinstance(device, DeformableMirror):
-        return mirror_checks(max_level)
-    if isinstance(device, Camera):
-        return camera_checks(max_level)
-    if isinstance(device, TipTiltModulator):
-        return modulator_checks(max_level)
-    if isinstance(device, PhaseScreen):
-        return screen_checks(max_level)
-    return checks_up_to(COMMON_CHECKS, max_level)
+    """Every check for the kind of a device, up to a level; those of the base classes come first."""
+    return _checks_of(type(device) if isinstance(device, Device) else Device, max_level)
+
+
+def _checks_of(kind: type, max_level: int = 3) -> list[Check]:
+    declared = (one for base in reversed(kind.__mro__) for one in CHECKS.get(base, ()))
+    return [one for one in declared if one.level <= max_level]
+
+
+#: Checks of a kind of device up to a level: ``mirror_checks(max_level=3)``.
+mirror_checks = partial(_checks_of, DeformableMirror)
+secondary_checks = partial(_checks_of, AdaptiveSecondary)
+camera_checks = partial(_checks_of, Camera)
+modulator_checks = partial(_checks_of, TipTiltModulator)
+screen_checks = partial(_checks_of, PhaseScreen)
 
 
 def run_checks(factory: Factory, max_level: int = 3) -> list[CheckResult]:

@@ -1,4 +1,4 @@
-"""Every general check fails on a device that breaks just what it checks."""
+"""Every general check fails on a device that violates only the checked rule."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 
 from escape_hw.api.device import Device
 from escape_hw.errors import DeviceError, NotOpen
-from escape_hw.testing.device import COMMON_CHECKS
+from escape_hw.testing.checks import CHECKS
 from escape_hw.testing.reference_devices import IdealPhaseScreen, RecordingMirror
 
 Broken = tuple[str, type[Device], str, dict[str, Any]]
@@ -83,4 +83,4 @@ def test_check_catches(catches: Catches, base: type[Device], expected: str, defe
 
 
 def test_every_check_is_tested() -> None:
-    assert {check.__name__ for check in COMMON_CHECKS} == {f"check_{case[2]}" for case in BROKEN}
+    assert {check.__name__ for check in CHECKS[Device]} == {f"check_{case[2]}" for case in BROKEN}

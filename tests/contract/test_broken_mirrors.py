@@ -1,4 +1,4 @@
-"""Every check on mirrors fails on a mirror that breaks just what it checks."""
+"""Every check on mirrors fails on a mirror that violates only the checked rule."""
 
 from __future__ import annotations
 
@@ -14,8 +14,7 @@ from escape_hw.api.device import Device
 from escape_hw.api.mirror import DeformableMirror, DMInfo, SendReport
 from escape_hw.errors import CommandRejected
 from escape_hw.safety.guard import GuardReport
-from escape_hw.testing import mirror_checks
-from escape_hw.testing.device import COMMON_CHECKS
+from escape_hw.testing.checks import CHECKS
 from escape_hw.testing.reference_devices import RecordingMirror
 
 Broken = tuple[str, type[Device], str, dict[str, Any]]
@@ -38,7 +37,7 @@ def unguarded(self: Any, command: Any) -> Any:
 
 
 def knocks_first(self: Any, command: Any) -> Any:
-    """Send what was asked for, and a moment later what the guard made of it."""
+    """Send the requested command, then the one limited by the guard."""
     self.require_open()
     self._send(np.real(np.asarray(command)).astype(float))
     return DeformableMirror.send(self, command)
@@ -184,6 +183,4 @@ def test_check_catches(catches: Catches, base: type[Device], expected: str, defe
 
 
 def test_every_check_is_tested() -> None:
-    assert {check.__name__ for check in set(mirror_checks()) - set(COMMON_CHECKS)} == {
-        f"check_{case[2]}" for case in BROKEN
-    }
+    assert {check.__name__ for check in CHECKS[DeformableMirror]} == {f"check_{case[2]}" for case in BROKEN}

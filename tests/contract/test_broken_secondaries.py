@@ -1,4 +1,4 @@
-"""Every check on adaptive secondaries fails on one that breaks just what it checks."""
+"""Every check on adaptive secondaries fails on one that violates only the checked rule."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The contract suite on devices that keep it, bare and inside wrappers that inject no fault."""
+"""The contract suite on valid devices, directly and inside wrappers that inject no fault."""
 
 from __future__ import annotations
 

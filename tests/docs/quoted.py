@@ -1,4 +1,4 @@
-"""What a page says that a command prints, held against what it printed."""
+"""The output quoted on a page, compared with the output of the command."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The page for authors of drivers names the hooks that there are."""
+"""The page for authors of drivers names all required hooks."""
 
 from __future__ import annotations
 

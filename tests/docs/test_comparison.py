@@ -1,4 +1,4 @@
-"""The comparison's short table says what the performance page says; its packages have versions and dates."""
+"""The comparison's short table agrees with the performance page; its packages have versions and dates."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Every example runs as a reader would run it, and says what it should."""
+"""Every example runs as a reader would run it, with the expected output."""
 
 from __future__ import annotations
 

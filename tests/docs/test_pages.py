@@ -1,4 +1,4 @@
-"""What the tutorials and how-to pages say can be done is done, in the order in which it stands there."""
+"""The commands and code of the tutorials and how-to pages run, in their order."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_a_page_can_be_followed(page: Path, tmp_path: Path) -> None:
             printed = run_block(block, tmp_path)
 
 
-def test_a_quotation_is_held_against_the_output() -> None:
+def test_a_quotation_is_compared_with_the_output() -> None:
     printed = "delay: 2.16 frames\n Shift X [%]  −16.036 ± 0.050   −0.7   −16\n"
     assert differences("delay: 2.17 frames\n Shift X [%] −16.05 ± 0.051  −0.9  −16", printed) == []
     assert len(differences("delay: 3.16 frames\nlag: 2.16 frames", printed)) == 2

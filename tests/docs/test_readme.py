@@ -1,4 +1,4 @@
-"""What the README and the documents say can be done, and what they point at is there."""
+"""Commands and code of the README and the documents run, and their links exist."""
 
 from __future__ import annotations
 

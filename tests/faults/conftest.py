@@ -1,4 +1,4 @@
-"""One calibration of the small twin, shared by the tests that need a good one to spoil."""
+"""One calibration of the small twin, shared by the tests that modify a valid one."""
 
 from __future__ import annotations
 

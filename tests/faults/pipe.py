@@ -1,15 +1,17 @@
-"""A driver and an emulated E-727 in one process, on a wire without delays and a clock that hurries."""
+"""A driver and an emulated E-727 in one process, without delays and with an accelerated clock."""
 
 from __future__ import annotations
 
 import time
+
+from usb_bus import UsbPipe
 
 from escape_drivers.pi.modulator import PiModulator
 from escape_drivers.pi.transports import TransportLost
 from escape_hw.config.loader import load_system
 from escape_sim.emulators.e727.controller import E727Controller
 from escape_sim.emulators.e727.state import ControllerSettings
-from escape_sim.emulators.e727.transports import FaultInjector, UsbPipe
+from escape_sim.emulators.e727.transports import FaultInjector
 
 #: How many times faster than real the emulated stage lives; the longest wait for a reply.
 HURRY, TIMEOUT_S = 40.0, 0.03

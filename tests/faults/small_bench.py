@@ -8,7 +8,7 @@ from small_system import configuration
 from escape_hw.runtime.session.system import System
 from escape_hw.testing import FaultyCamera, FaultyMirror
 
-PLANTED = np.array([-16.0, -71.0, -0.77, 2.9, 0.0])
+INJECTED = np.array([-16.0, -71.0, -0.77, 2.9, 0.0])
 
 
 def small(*more: str, seed: int | None = None) -> System:

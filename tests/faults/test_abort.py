@@ -1,4 +1,4 @@
-"""Stopped in the middle of each procedure: flat within a second, and what was measured is kept."""
+"""Stopped in the middle of each procedure: flat within a second, measured data saved."""
 
 from __future__ import annotations
 
@@ -113,7 +113,7 @@ def test_a_partial_push_pull_holds_the_modes_that_were_reached(good):
 
 
 @pytest.mark.parametrize("place", ["DO-CRIME", "ESCAPE, DO-CRIME", "ESCAPE, model", "ESCAPE, SPRINT"])
-def test_a_partial_docrime_is_a_good_matrix_with_honest_errors(good, place):
+def test_a_partial_docrime_is_a_good_matrix_with_correct_errors(good, place):
     procedure, stage, share = PLACES[place]
     stop = StopThere(stage, share)
     with small("twin.loss_probability=0") as bench, pytest.raises(Aborted) as caught:
@@ -128,7 +128,7 @@ def test_a_partial_docrime_is_a_good_matrix_with_honest_errors(good, place):
     assert np.mean(np.square(pulls)) < 4
 
 
-def test_a_reproduction_keeps_what_was_finished(good):
+def test_a_reproduction_saves_the_finished_parts(good):
     stop = StopThere("loop at gain", 0.2)
     with small() as bench, pytest.raises(Aborted) as caught:
         bench.run(reproduce_shwfs(bench, frames=400), observers=(stop,), abort=stop.abort)

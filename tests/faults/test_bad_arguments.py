@@ -1,4 +1,4 @@
-"""Arguments that mean nothing are refused before anything moves."""
+"""Invalid arguments are refused before anything moves."""
 
 from __future__ import annotations
 

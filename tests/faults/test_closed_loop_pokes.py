@@ -1,4 +1,4 @@
-"""DO-CRIME in closed loop on the small twin: right at 0.2 % of the stroke, and every fault is met."""
+"""DO-CRIME in closed loop on the small twin: correct at 0.2 % of the stroke, with every fault handled."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from small_bench import PLANTED, assert_flat, dead, small
+from small_bench import INJECTED, assert_flat, dead, small
 
 from escape_hw.api.results import CalibrationResult
 from escape_hw.calibration.acquisition.pokes import PushPullPokes
@@ -77,7 +77,7 @@ def test_registration_from_tiny_pokes_in_closed_loop(closed_loop):
     estimate = found.registration
     assert estimate.converged, estimate.warnings
     assert found.measured.method == "docrime-closed"
-    assert np.abs((estimate.registration.to_array() - PLANTED) / estimate.sigma).max() < 4
+    assert np.abs((estimate.registration.to_array() - INJECTED) / estimate.sigma).max() < 4
     assert (estimate.sigma < [0.6, 0.6, 0.03, 0.2, 0.2]).all()
 
 
@@ -122,7 +122,7 @@ def test_faults_that_bias_nothing(closed_loop, truth, more, allowed):
         assert any("limits shortened" in note for note in found.notes)
 
 
-def test_dead_actuators_that_nobody_knows_show_in_the_matrix(closed_loop, truth):
+def test_unknown_failed_actuators_show_in_the_matrix(closed_loop, truth):
     """What the mirror no longer does is missing from the matrix, as in open loop, and the rest is right."""
     broken = (18, 25)
     found = measure(closed_loop, prepare=lambda bench: dead(bench, *broken), frames=2500)
@@ -157,7 +157,7 @@ def test_disabled_actuators(good):
     ],
     ids=["wrong matrix", "wrong delay"],
 )
-def test_a_loop_that_diverges_is_opened_and_told(closed_loop, more, factor):
+def test_a_loop_that_diverges_is_opened_and_reported(closed_loop, more, factor):
     spoilt = replace(
         closed_loop, matrix=replace(closed_loop.matrix, data=closed_loop.matrix.data * np.float32(factor))
     )
@@ -165,7 +165,7 @@ def test_a_loop_that_diverges_is_opened_and_told(closed_loop, more, factor):
         measure(spoilt, *more)
 
 
-def test_a_delay_beyond_the_lags_is_told(closed_loop):
+def test_a_delay_beyond_the_lags_is_reported(closed_loop):
     with pytest.raises(CalibrationError, match=r"beyond calibration\.lags = 3 frames"):
         measure(closed_loop, "twin.latency_s=0.006", "loop.gain=0.1", "calibration.lags=3")
 
@@ -175,12 +175,12 @@ def test_a_mirror_that_does_not_answer(closed_loop):
         measure(closed_loop, "devices.dm.stroke_m=1e-12")
 
 
-def test_the_light_goes(closed_loop):
+def test_the_light_is_lost(closed_loop):
     with pytest.raises(CalibrationError, match="no light"):
         measure(closed_loop, prepare=lambda bench: bench.screen.set(blocked=True))
 
 
-def test_it_stops_at_the_ratio_asked_for(closed_loop):
+def test_it_stops_at_the_requested_ratio(closed_loop):
     found = measure(closed_loop, frames=20_000, until=Target(snr=20.0))
     assert found.matrix.snr().min() >= 20
     assert found.frames < 10_000
@@ -188,7 +188,7 @@ def test_it_stops_at_the_ratio_asked_for(closed_loop):
 
 
 @pytest.mark.parametrize("in_loop", [pytest.param(True, marks=pytest.mark.slow), False])
-def test_escape_stops_at_the_accuracy_asked_for(closed_loop, in_loop):
+def test_escape_stops_at_the_requested_accuracy(closed_loop, in_loop):
     with small(NO_LOSS) as bench:
         options = {"closing": closed_loop} if in_loop else {}
         found = bench.run(escape(bench, frames=8000, until=Target(accuracy=0.2), **options))
@@ -198,7 +198,7 @@ def test_escape_stops_at_the_accuracy_asked_for(closed_loop, in_loop):
     assert found.registration.sigma[:2].max() < 0.22
     assert found.frames < 4000
     assert (
-        np.abs((found.registration.registration.to_array() - PLANTED) / found.registration.sigma).max() < 4.5
+        np.abs((found.registration.registration.to_array() - INJECTED) / found.registration.sigma).max() < 4.5
     )
 
 

@@ -1,4 +1,4 @@
-"""Wrong input and dying devices through the real command line, on the real twin."""
+"""Wrong input and failing devices through the real command line, on the real twin."""
 
 from __future__ import annotations
 
@@ -179,7 +179,7 @@ def test_truncated_and_flipped_products(run, system, im, command, tmp_path):
         refused(bytes(flipped))
 
 
-def test_a_dead_camera_and_a_lost_mirror_exit_3(run, system, im, tmp_path, monkeypatch):
+def test_a_failed_camera_and_a_lost_mirror_exit_3(run, system, im, tmp_path, monkeypatch):
     monkeypatch.setattr(registry, "_REGISTERED", {})
     opened = []
 

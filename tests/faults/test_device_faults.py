@@ -1,4 +1,4 @@
-"""A device that dies in the middle: a typed error that names it, and a flat mirror."""
+"""A device that fails during a run: a typed error that names it, and a flat mirror."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def scene(bench):
 
 @pytest.mark.parametrize("name", PROCEDURES)
 @pytest.mark.parametrize("frame", [0, 90])
-def test_a_dead_camera(good, name, frame):
+def test_a_failed_camera(good, name, frame):
     with faulty(wfs={"stall_from": frame}) as bench:
         before = bench.wfs.now_ns()
         with pytest.raises(FrameTimeout, match=r"^wfs: no frame within 1 s") as caught:
@@ -74,7 +74,7 @@ def test_a_transfer_that_fails_once(good, name):
 
 
 @pytest.mark.parametrize("name", MOVING)
-def test_a_lost_mirror_keeps_its_last_shape_and_that_is_said(good, name):
+def test_a_lost_mirror_keeps_its_last_shape_and_this_is_reported(good, name):
     bench = faulty(dm={"lost_from": 15}).open()
     with pytest.raises(DeviceLost, match=r"^dm: lost"):
         bench.run(PROCEDURES[name](bench, good))
@@ -103,7 +103,7 @@ def test_a_science_camera_lost_under_the_loop_opens_it(good):
         assert_flat(bench)
 
 
-def test_a_science_camera_that_stalls_under_the_loop_is_told(good):
+def test_a_science_camera_that_stalls_under_the_loop_is_reported(good):
     with faulty(science={"stall_from": 5}) as bench:
         result = bench.run(close_loop(bench, good.matrix, good.grid, frames=1000, model_psf=good.psf))
         assert result.stable

@@ -1,4 +1,4 @@
-"""Whatever fails between driver and controller, at whatever command: promised state, in time, and told."""
+"""Faults between driver and controller at every command: documented state, within the time-out, reported."""
 
 from __future__ import annotations
 

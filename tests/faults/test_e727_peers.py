@@ -1,4 +1,4 @@
-"""Peers that are not there, say nothing, or stop in the middle: an end in time, and a word on what to do."""
+"""Peers that are absent, silent, or stop in the middle: an error in time, with a remedy."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from escape_hw.errors import DeviceLost
 
 ESCAPE = (sys.executable, "-c", "from escape_hw.cli import main; main()")
 CIRCLE = Modulation(1.41e-4, 303.03)
-#: What the drivers here are promised to need: three time-outs; and what a busy machine may make of it.
+#: What the drivers here are documented to need: three time-outs; and what a busy machine may make of it.
 TIMEOUT_S, LONGEST_S = 0.2, 10.0
 
 
@@ -44,7 +44,7 @@ def listener() -> Iterator[socket.socket]:
         yield listening
 
 
-def test_nobody_listens(listener):
+def test_no_server_listens(listener):
     port = listener.getsockname()[1]
     listener.close()
     lost_in_time(
@@ -70,7 +70,7 @@ def test_packets_vanish(listener):
             filler.close()
 
 
-def test_a_peer_that_takes_the_call_and_says_nothing(listener):
+def test_a_peer_that_takes_the_call_and_does_not_reply(listener):
     stage = driver(listener.getsockname()[1])
     lost_in_time(stage.open, r"does not answer \(waited 0\.4 s\); .* Switch it off and on, then open again")
     assert not stage.is_open
@@ -114,7 +114,7 @@ def test_a_peer_that_freezes_is_lost_in_time_and_found_again(emulator):
     stage.modulate(CIRCLE)
     os.kill(process.pid, signal.SIGSTOP)
     lost_in_time(lambda: stage.modulate(CIRCLE), r"does not answer .* Switch it off and on, then open again")
-    # From now on every call says so at once.
+    # From now on every call reports it at once.
     for call in (stage.park, stage.status, lambda: stage.modulation, lambda: stage.modulate(CIRCLE)):
         with pytest.raises(DeviceLost, match=r"does not answer"):
             call()

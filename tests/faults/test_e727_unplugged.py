@@ -7,6 +7,7 @@ import time
 
 import pytest
 import usb.core
+from usb_bus import VENDOR, UsbBackend, UsbPipe
 
 from escape_drivers.pi.modulator import PiModulator
 from escape_drivers.pi.transports import SerialTransport, TransportLost, UsbTransport
@@ -15,8 +16,7 @@ from escape_hw.config.loader import load_system
 from escape_hw.errors import DeviceLost
 from escape_sim.emulators.e727.controller import E727Controller
 from escape_sim.emulators.e727.state import ControllerSettings
-from escape_sim.emulators.e727.transports import FaultInjector, PtyServer, UsbPipe
-from escape_sim.emulators.e727.usb_backend import VENDOR, UsbBackend
+from escape_sim.emulators.e727.transports import FaultInjector, PtyServer
 
 CIRCLE = Modulation(1.41e-4, 303.03)
 LONGEST_S = 10.0
@@ -61,7 +61,7 @@ def test_a_serial_line_that_is_not_there():
     )
 
 
-def test_a_serial_line_that_somebody_else_holds():
+def test_a_serial_line_in_use_by_another_process():
     server = PtyServer(controller(), FaultInjector())
     port = server.start().removeprefix("pty ")
     try:
@@ -90,7 +90,7 @@ def test_usb_is_taken_from_the_kernel_and_given_back():
     assert (here.kernel_driver, here.claimed) == (True, False)
 
 
-def test_usb_in_use_is_told():
+def test_usb_in_use_is_reported():
     here = bus()
     with stage(UsbTransport(VENDOR, None, "SIMMOD", 0.2, here)):
         lost_in_time(stage(UsbTransport(VENDOR, None, "SIMMOD", 0.2, here)).open, r"cannot claim USB 1a72:\*")
@@ -124,7 +124,7 @@ def test_usb_without_permission(monkeypatch):
 @pytest.mark.parametrize(
     "transport", [SerialTransport("/dev/x", 9600, 0.1), UsbTransport(1, None, "", 0.1, bus())]
 )
-def test_a_wire_that_is_not_open_says_so(transport):
+def test_a_wire_that_is_not_open_is_reported(transport):
     for call in (lambda: transport.write(b"x"), lambda: transport.read(0.0)):
         with pytest.raises(TransportLost, match="is not open"):
             call()

@@ -1,4 +1,4 @@
-"""The loop that stays closed until told: changes without a bump, and what opens it by itself."""
+"""The loop that stays closed until it is opened: changes without a transient, and automatic opening."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def largest_step(sent):
     return np.abs(np.diff(sent[:-20], axis=0)).max(axis=1)
 
 
-def test_it_stays_closed_until_told_and_tells_how_it_is(bench, good):
+def test_it_stays_closed_until_opened_and_reports_its_state(bench, good):
     found, operator, _ = kept(bench, good, psf=good.psf, end=1500)
     assert found.fault == ""
     assert 1500 <= found.frames < 1500 + 60
@@ -81,7 +81,7 @@ def test_the_strehl_ratio_is_followed(bench, good):
     assert found.fault == ""
 
 
-def test_settings_change_without_a_bump(bench, good):
+def test_settings_change_without_a_transient(bench, good):
     other = replace(good.run.result, matrix=replace(good.matrix, data=good.matrix.data * 1.02))
     steps = (
         (400, lambda loop_control: loop_control.request_change(gain=0.2)),
@@ -147,7 +147,7 @@ def test_a_loop_of_the_wrong_sign_is_opened(bench, good, sign):
     assert found.frames < 2000
 
 
-def test_a_loop_that_goes_dark_is_opened(bench, good):
+def test_a_loop_that_loses_its_light_is_opened(bench, good):
     def dark(loop_control):
         bench.screen.set(blocked=True)
 
@@ -201,7 +201,7 @@ def test_an_abort_opens_it(bench, good):
     assert caught.value.partial.frames > 100
 
 
-def test_a_measurement_goes_on_from_the_loops_own_matrix(bench, good):
+def test_a_measurement_continues_from_the_loops_own_matrix(bench, good):
     loop_control = LoopControl(bench, good.run.result)
     found = bench.run(
         run_until_opened(bench, loop_control), observers=(Operator(bench, loop_control, end=300),)
@@ -212,7 +212,7 @@ def test_a_measurement_goes_on_from_the_loops_own_matrix(bench, good):
     assert np.array_equal(result.matrix.m2c, good.matrix.m2c)
 
 
-def test_a_real_loop_asks_for_priority_and_says_what_was_refused(bench, good, monkeypatch, caplog):
+def test_a_real_loop_requests_priority_and_reports_what_was_refused(bench, good, monkeypatch, caplog):
     asked = []
 
     @contextmanager

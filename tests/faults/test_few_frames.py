@@ -1,4 +1,4 @@
-"""Hardly enough frames: the errors are large and honest, whatever comes out is never garbage."""
+"""Hardly enough frames: large but correct errors, or a refusal."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from small_bench import PLANTED, assert_flat, small
+from small_bench import INJECTED, assert_flat, small
 
 from escape_hw.calibration.docrime.open_loop import docrime_run
 from escape_hw.calibration.sprint.fit import sprint
@@ -40,7 +40,7 @@ def test_stated_errors_against_the_truth(good, short_runs, frames, whiten):
         assert np.isfinite(matrix.data).all()
         assert (matrix.sigma > 0).all()
         gain = float(np.vdot(matrix.data, good.matrix.data) / np.vdot(good.matrix.data, good.matrix.data))
-        # The response is scaled to sum 1 and comes from few frames: it errs for all elements alike.
+        # The response is scaled to sum 1 and comes from few frames: it has an error common to all elements.
         errors = (matrix.data / gain - good.matrix.data) / np.hypot(matrix.sigma, good.matrix.sigma)
         chi2.append(np.mean(np.square(errors)))
         gains.append(gain)
@@ -55,17 +55,17 @@ def test_errors_grow_towards_the_limit(short_runs):
 
 
 @pytest.mark.parametrize("frames", JUST_ENOUGH)
-def test_the_registration_is_right_within_its_errors_or_says_that_it_is_not(good, short_runs, frames):
+def test_the_registration_is_right_within_its_errors_or_reports_that_it_is_not(good, short_runs, frames):
     pulls = []
     for run in short_runs[frames, True][: RUNS // 2]:
         estimate = sprint(run.result.matrix, good.model, modes=20, covariance=run.solution.covariance)
         if estimate.converged:
-            pulls.append((estimate.registration.to_array() - PLANTED) / estimate.sigma)
+            pulls.append((estimate.registration.to_array() - INJECTED) / estimate.sigma)
         else:
             assert estimate.warnings
     assert pulls
     assert np.abs(pulls).max() < 5
-    # A matrix from as few frames as it takes leans to smaller scalings, by two of its errors or so.
+    # A matrix from the minimum number of frames is biased to smaller scalings, by two of its errors or so.
     assert np.mean(np.square(pulls)) < 4.5
 
 
@@ -81,12 +81,12 @@ def test_the_full_bench_at_its_limit():
             run.result.matrix, bench.model(run.result.grid), modes=50, covariance=run.solution.covariance
         )
     assert estimate.converged, estimate.warnings
-    pulls = (estimate.registration.to_array() - PLANTED) / estimate.sigma
+    pulls = (estimate.registration.to_array() - INJECTED) / estimate.sigma
     assert np.abs(pulls).max() < 4
 
 
 def test_loss_that_leaves_too_few_complete_frames_is_an_error():
-    """Enough frames were asked for, but half of them got lost: refused with the number needed."""
+    """Enough frames were requested, but half of them got lost: refused with the number needed."""
     with small("twin.loss_probability=0.5") as bench:
         with pytest.raises(TooFewFrames, match=r"complete frames cannot constrain 30 modes; at least \d+"):
             bench.run(docrime_run(bench, frames=100))
@@ -101,7 +101,7 @@ def test_a_reproduction_with_too_few_frames_is_refused_before_its_baseline(bench
     assert_flat(bench)
 
 
-def test_a_loop_too_short_for_its_strehl_ratio_says_how_long_it_must_be(good, shared):
+def test_a_loop_too_short_for_its_strehl_ratio_states_how_long_it_must_be(good, shared):
     def run(frames):
         return shared.close_loop(good.matrix, good.grid, frames=frames, model_psf=good.psf)
 

@@ -1,4 +1,4 @@
-"""The registration from a tenth of a second of a running loop: right over seeds, refusals in words."""
+"""The registration from a tenth of a second of a running loop: correct over seeds, or refused."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from small_bench import PLANTED, assert_flat, small
+from small_bench import INJECTED, assert_flat, small
 
 from escape_hw.calibration.escape.method import escape
 from escape_hw.errors import Aborted, CalibrationError, TooFewFrames
@@ -31,7 +31,7 @@ def closed_loop(good):
 
 
 def pull(found) -> np.ndarray:
-    return (found.registration.registration.to_array() - PLANTED) / found.registration.sigma
+    return (found.registration.registration.to_array() - INJECTED) / found.registration.sigma
 
 
 @pytest.mark.parametrize(
@@ -71,14 +71,14 @@ def test_smaller_pokes_and_more_frames_give_larger_errors_and_smaller_ones(close
 
 
 def test_it_is_the_answer_of_the_frames_and_not_of_the_matrix_that_closes_the_loop(closed_loop, good):
-    """A closing matrix for a mirror that stands elsewhere, and says so: the answer is the same."""
+    """A control matrix for a mirror of another registration: the result is the same."""
     from escape_hw.api.registration import Registration
     from escape_hw.calibration.modes.derivatives import modal_matrix
 
-    moved = PLANTED + np.array([15.0, -15.0, 0.3, 0.5, -0.5])
+    moved = INJECTED + np.array([15.0, -15.0, 0.3, 0.5, -0.5])
     m2c = closed_loop.matrix.m2c
     gain = np.linalg.norm(closed_loop.matrix.data) / np.linalg.norm(
-        modal_matrix(good.model, Registration.from_array(PLANTED), m2c)
+        modal_matrix(good.model, Registration.from_array(INJECTED), m2c)
     )
     wrong = gain * modal_matrix(good.model, Registration.from_array(moved), m2c)
     found = measured(replace(closed_loop, matrix=replace(closed_loop.matrix, data=wrong.astype(np.float32))))

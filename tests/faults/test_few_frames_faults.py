@@ -1,10 +1,10 @@
-"""A tenth of a second in open loop on a bench that is not well: right within the errors, or refused."""
+"""A tenth of a second in open loop on a faulty bench: correct within the errors, or refused."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-from small_bench import PLANTED, assert_flat, dead, small
+from small_bench import INJECTED, assert_flat, dead, small
 
 from escape_hw.calibration.escape.method import escape
 from escape_hw.errors import CalibrationError
@@ -37,7 +37,7 @@ def test_right_within_its_errors(name):
         assert found.registration.converged, found.registration.warnings
         if name == "clipped pokes":
             assert found.matrix.metrics["clipped_pokes"] > FRAMES / 2
-        pulls.append((found.registration.registration.to_array() - PLANTED) / found.registration.sigma)
+        pulls.append((found.registration.registration.to_array() - INJECTED) / found.registration.sigma)
     assert np.abs(pulls).max() < 5
     # Under this vibration, four times the usual, the scalings come out 0.2 % too small, 2.5 errors.
     assert np.mean(np.square(pulls)) < 6

@@ -1,4 +1,4 @@
-"""The bootstrap stopped on its way: mirror flat, and what was measured is kept and can be saved."""
+"""The bootstrap stopped while it runs: mirror flat, measured data kept, and they can be saved."""
 
 from __future__ import annotations
 

@@ -1,10 +1,10 @@
-"""Pokes that the mirror's limits cut short are still known pokes: the matrix stays unbiased."""
+"""Pokes limited by the mirror are used as sent: the matrix stays unbiased."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-from small_bench import PLANTED, assert_flat, faulty, small
+from small_bench import INJECTED, assert_flat, faulty, small
 
 from escape_hw.calibration.docrime.open_loop import docrime_run
 from escape_hw.calibration.modes.bases import build_modal_basis
@@ -46,7 +46,7 @@ def test_docrime_with_shortened_pokes(good, name):
     assert gain == pytest.approx(1, abs=0.03)
     estimate = sprint(matrix, good.model, modes=20, covariance=run.solution.covariance)
     assert estimate.converged, estimate.warnings
-    assert np.abs((estimate.registration.to_array() - PLANTED) / estimate.sigma).max() < 4
+    assert np.abs((estimate.registration.to_array() - INJECTED) / estimate.sigma).max() < 4
 
 
 @pytest.mark.parametrize("name", SOME)
@@ -80,7 +80,7 @@ def test_disabled_actuators(disabled):
     assert run.result.matrix.snr().min() > 5
     estimate = sprint(run.result.matrix, model, modes=20, covariance=run.solution.covariance)
     assert estimate.converged, estimate.warnings
-    assert np.abs((estimate.registration.to_array() - PLANTED) / estimate.sigma).max() < 5
+    assert np.abs((estimate.registration.to_array() - INJECTED) / estimate.sigma).max() < 5
 
 
 def test_more_modes_than_working_actuators_make():

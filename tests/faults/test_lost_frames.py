@@ -1,4 +1,4 @@
-"""Lost frames lose pairs and shift none: the same matrix within its errors, the same registration."""
+"""Lost frames remove pairs and shift none: the same matrix within its errors, the same registration."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from itertools import count, pairwise
 
 import numpy as np
 import pytest
-from small_bench import PLANTED, assert_flat, faulty, small
+from small_bench import INJECTED, assert_flat, faulty, small
 
 from escape_hw.calibration.docrime.estimator import DocrimeEstimator
 from escape_hw.calibration.docrime.open_loop import docrime_run
@@ -56,7 +56,7 @@ def test_the_same_matrix_within_its_noise(good, runs, loss):
 
 
 def test_what_is_lost_shows_in_the_errors(runs):
-    """Ten lost frames in a hundred break most of the pasts that the filter needs, and sigma says so."""
+    """Losing a tenth of the frames interrupts most histories of the filter, which sigma includes."""
     size = {loss: np.median([r.result.matrix.sigma for r in found]) for loss, found in runs.items()}
     assert size[0.0] < size[0.1] < 2 * size[0.0]
     assert size[0.01] == pytest.approx(size[0.0], rel=0.1)
@@ -67,7 +67,7 @@ def test_the_same_registration(good, runs, loss):
     for run in runs[loss]:
         estimate = sprint(run.result.matrix, good.model, modes=20, covariance=run.solution.covariance)
         assert estimate.converged, estimate.warnings
-        pulls = (estimate.registration.to_array() - PLANTED) / estimate.sigma
+        pulls = (estimate.registration.to_array() - INJECTED) / estimate.sigma
         assert np.abs(pulls).max() < 4
         assert (estimate.sigma < [1, 1, 0.05, 0.3, 0.3]).all()
 

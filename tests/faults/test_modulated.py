@@ -1,4 +1,4 @@
-"""Modulation on the small twin: the same matrix as DO-CRIME, from a sixth of the frames, and its faults."""
+"""Modulation on the small twin: the same matrix as DO-CRIME, from a sixth of the frames, and faults."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_stopped_after_the_first_batch_it_keeps_that():
     assert 0 < partial.matrix.n_modes < 30
 
 
-def test_a_mirror_that_does_not_move_is_told():
+def test_a_mirror_that_does_not_move_is_reported():
     with small("devices.dm.stroke_m=1e-12") as bench:
         with pytest.raises(CalibrationError, match="does not respond"):
             bench.run(modulation_demodulation(bench, frames=200))

@@ -1,4 +1,4 @@
-"""The same seed gives the same bits; the twin's clock is its own, or the wall's when paced."""
+"""The same seed gives identical results; the twin has a simulated clock, or real time when paced."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Broken off and resumed: the same result in statistics, and nothing is resumed that does not fit."""
+"""Interrupted and resumed: statistically the same result; states that do not fit are refused."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from escape_hw.errors import Aborted, IncompatibleProduct, ProductError
 from escape_hw.io.fits.run_state import load_state
 from escape_hw.runtime.procedures.calibration import calibrate_with_method
 
-#: States now and then; the last is that of the moment it was broken off.
+#: States now and then; the last is that of the moment it was interrupted.
 OFTEN = ("twin.loss_probability=0.002", "calibration.checkpoint_s=0.2")
-#: Method, options, and the stage and the share of it after which the run is broken off.
+#: Method, options, and the stage and the share of it after which the run is interrupted.
 CASES = {
     "docrime": ("docrime", {"frames": 3000}, "DO-CRIME", 0.6),
     "docrime, first frames": ("docrime", {"frames": 1500}, "DO-CRIME", 0.3),
@@ -29,7 +29,7 @@ CASES = {
 
 
 def measure(good, name, path, *, resume=None, stop=True, more=()):
-    """Run a case, broken off in the middle if asked."""
+    """Run a case, interrupted in the middle if asked."""
     method, options, stage, share = CASES[name]
     closed_loop = good.run.result if "closed" in name else None
     abort = threading.Event()
@@ -54,8 +54,8 @@ EVERY = [pytest.param(name, marks=pytest.mark.slow) if name == "push-pull-fast" 
 
 
 @pytest.mark.parametrize("name", EVERY)
-def test_broken_off_and_resumed_it_equals_the_uninterrupted_run(good, tmp_path, monkeypatch, name):
-    # Progress at every frame, so that a run of a fifth of a second can be broken off in its middle.
+def test_interrupted_and_resumed_it_equals_the_uninterrupted_run(good, tmp_path, monkeypatch, name):
+    # Progress at every frame, so that a run of a fifth of a second can be interrupted in its middle.
     monkeypatch.setattr("escape_hw.api.procedure.Reporter.PERIOD_S", 0.0)
     path = tmp_path / "run.state"
     with pytest.raises(Aborted) as caught:
@@ -83,7 +83,7 @@ def test_broken_off_and_resumed_it_equals_the_uninterrupted_run(good, tmp_path, 
 
 @pytest.fixture(scope="module")
 def kept(good, tmp_path_factory):
-    """The state of a run that was broken off."""
+    """The state of a run that was interrupted."""
     path = tmp_path_factory.mktemp("kept") / "run.state"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("escape_hw.api.procedure.Reporter.PERIOD_S", 0.0)

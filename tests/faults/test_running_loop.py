@@ -1,4 +1,4 @@
-"""The loop frame by frame: pokes beside the controller, what the limits leave, and exchange on the run."""
+"""The loop frame by frame: pokes added to the controller's command, clipping, and exchange of the matrix."""
 
 from __future__ import annotations
 

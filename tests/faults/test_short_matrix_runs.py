@@ -1,10 +1,10 @@
-"""Runs hardly long enough for a matrix: the frames themselves tell the registration better than its sums."""
+"""Runs hardly long enough for a matrix: a fit to the frames is more accurate than one to the sums."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-from small_bench import PLANTED, small
+from small_bench import INJECTED, small
 
 from escape_hw.api.procedure import run
 from escape_hw.calibration.docrime.open_loop import docrime_run
@@ -29,8 +29,8 @@ def test_the_frames_err_less_than_the_sums_of_a_matrix():
             sums = run(
                 fit_registration(columns, model, covariance=solution.covariance, update_priors=True)
             ).estimate
-            by_frames[k] = frames.registration.to_array() - PLANTED
-            by_sums[k] = sums.registration.to_array() - PLANTED
+            by_frames[k] = frames.registration.to_array() - INJECTED
+            by_sums[k] = sums.registration.to_array() - INJECTED
     ratio = np.sqrt(np.square(by_frames).mean(axis=0) / np.square(by_sums).mean(axis=0))
     # The scalings are the model's own errors here. Measured: 0.72, 0.84, 0.58.
     assert ratio[:3].mean() < 0.9

@@ -1,4 +1,4 @@
-"""SPRINT on what is no matrix of this system: an error, or not converged with words; never wrong."""
+"""SPRINT on matrices of another system or of noise: an error, or not converged with a warning."""
 
 from __future__ import annotations
 

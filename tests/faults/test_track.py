@@ -1,4 +1,4 @@
-"""The tracker on a bench that drifts, jumps, breaks, goes dark or is stopped."""
+"""The tracker on a bench that drifts, jumps, fails, loses its light or is stopped."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def kinds(found):
     return {alarm.kind for alarm in found.alarms}
 
 
-def test_a_drift_is_followed_and_exchanged_without_a_bump(start, monkeypatch):
+def test_a_drift_is_followed_and_exchanged_without_a_transient(start, monkeypatch):
     swaps, steps = [], []
     answer, swap = LeakyIntegrator.__call__, LeakyIntegrator.set_reconstructor
 
@@ -153,7 +153,7 @@ def test_a_jump_raises_an_alarm_and_is_found_again(start):
     assert not [one for one in found.exchanges if 0 <= one.seconds - found.alarms[0].seconds <= 4]
 
 
-def test_a_dead_actuator_raises_an_alarm_that_no_registration_explains(start):
+def test_a_failed_actuator_raises_an_alarm_that_no_registration_explains(start):
     def die(twin):
         send = twin.dynamics.command
 
@@ -228,7 +228,7 @@ def test_a_lost_star_ends_tracking_and_keeps_the_table(start):
     assert 3 <= len(found.rows["seconds"]) <= 6
 
 
-def test_a_loop_that_runs_away_is_opened_and_told(start):
+def test_a_loop_that_runs_away_is_opened_and_reported(start):
     def turn(twin):
         send = twin.dynamics.command
         twin.dynamics.command = lambda time_s, shape: send(time_s, -shape)
@@ -241,7 +241,7 @@ def test_a_loop_that_runs_away_is_opened_and_told(start):
     assert found.latest is not None
 
 
-def test_stopped_it_keeps_what_it_has(start):
+def test_when_stopped_it_saves_its_data(start):
     stop = threading.Event()
     with small(QUIET) as bench:
         procedure = track(bench, start.matrix, start.grid, seconds=3600, registration=start.registration)

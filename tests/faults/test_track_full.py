@@ -59,7 +59,7 @@ def die(shape):
     return left
 
 
-def test_a_dead_actuator_is_named_and_nothing_exchanged_for_it(start):
+def test_a_failed_actuator_is_named_and_nothing_exchanged_for_it(start):
     # Pokes this small name it when half of the memory's frames are from after its death.
     found = followed(start, commands(die), seconds=AT + 8)
     assert [alarm.kind for alarm in found.alarms] == ["actuator"]

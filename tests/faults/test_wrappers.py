@@ -1,4 +1,4 @@
-"""Wrappers that inject faults: they do what was arranged, and nothing else."""
+"""Wrappers that inject faults: they inject the given faults and nothing else."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def test_one_transfer_can_fail_and_the_next_pass() -> None:
     assert [float(shape[0]) for shape in dm.reached[:2]] == [0.1, 0.3]
 
 
-def test_a_lost_mirror_takes_nothing_more_and_says_so_on_closing() -> None:
+def test_a_lost_mirror_takes_nothing_more_and_is_reported_on_closing() -> None:
     inner = RecordingMirror()
     dm = FaultyMirror(inner, lost_from=1)
     dm.open()

@@ -35,7 +35,7 @@ class Stage:
         self.bot.waitUntil(lambda: self.control.asked == [(verb, arguments)], timeout=5000)
 
     def refused(self, name: str) -> None:
-        """The chosen file is not a recorded run, and a notification says so."""
+        """The chosen file is not a recorded run, and a notification reports it."""
         self.bot.waitUntil(lambda: bool(self.window.notifications.notifications), timeout=5000)
         assert name in self.window.notifications.notifications[-1].text
 
@@ -167,7 +167,7 @@ def test_every_action_does_what_it_says(
         (("record",), {"lease": SOMEBODY}, "ben on control has control"),
     ],
 )
-def test_an_impossible_action_says_why(
+def test_an_impossible_action_gives_the_reason(
     names: tuple[str, ...],
     state: dict[str, object],
     reason: str,

@@ -1,4 +1,4 @@
-"""Frames of four pupil images with everything known, made without the twin's optics."""
+"""Frames of four pupil images with known parameters, computed without the twin's optics."""
 
 from __future__ import annotations
 

@@ -256,7 +256,7 @@ def test_it_is_seeded_and_the_order_of_asking_does_not_matter():
     assert not np.allclose(forward[0], phase(make_layer(5, wind=(20.0, 5.0), boiling=0.2), 0.0))
 
 
-def test_it_may_be_asked_for_times_before_zero():
+def test_it_may_be_evaluated_at_times_before_zero():
     layer = make_layer(4, wind=(20.0, 5.0), boiling=0.2)
     values = [phase(layer, t).std() for t in (-3.0, -0.01)]
     assert min(values) > 0

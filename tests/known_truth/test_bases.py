@@ -1,4 +1,4 @@
-"""The registration is found with every modal basis, and with every way of solving for it."""
+"""The registration is recovered with every modal basis and every solver."""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ PITCH = 100 * 16 / 5
 
 
 @pytest.mark.parametrize("number", range(3))
-def test_comes_home_or_says_that_it_does_not(number: int) -> None:
+def test_converges_or_reports_that_it_does_not(number: int) -> None:
     config = configuration()
     pupils = nominal_pupils(config)
     model = PyramidModel(config, pupils)

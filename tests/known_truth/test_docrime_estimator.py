@@ -13,7 +13,7 @@ RESPONSE = np.array([0.0, 0.1, 0.75, 0.15, 0.0])
 
 
 def make(frames, *, seed=0, turbulence=0.1, noise=2e-3, poke=0.01, order=2):
-    """Slopes, pokes and the truth; slopes of a frame answer to the pokes of the frames before it."""
+    """Slopes, pokes and the true matrix; slopes of a frame respond to the pokes of the frames before it."""
     rng = np.random.default_rng(seed)
     truth = rng.standard_normal((N_SLOPES, N_MODES))
     pokes = rng.uniform(-poke, poke, (frames, N_MODES))
@@ -26,8 +26,8 @@ def make(frames, *, seed=0, turbulence=0.1, noise=2e-3, poke=0.01, order=2):
     rate = np.array([1.95, -0.9525]) if order == 2 else np.array([0.99, 0.0])
     for k in range(2, len(state)):
         state[k] = rate[0] * state[k - 1] + rate[1] * state[k - 2] + kicks[k]
-    air = state[200:] / state[200:].std()
-    slopes = seen @ truth.T + turbulence * air + rng.normal(0, noise, (frames, N_SLOPES))
+    normalised = state[200:] / state[200:].std()
+    slopes = seen @ truth.T + turbulence * normalised + rng.normal(0, noise, (frames, N_SLOPES))
     return slopes.astype(np.float32), pokes, truth
 
 
@@ -118,7 +118,7 @@ def test_the_caller_may_reuse_its_arrays():
     assert np.allclose(estimator.solve().matrix, solved(slopes, pokes).matrix, rtol=0, atol=1e-5)
 
 
-def test_a_short_run_still_gives_honest_errors():
+def test_a_short_run_still_gives_correct_errors():
     chi2 = []
     for seed in range(6):
         slopes, pokes, truth = make(120, seed=seed, turbulence=0.02)

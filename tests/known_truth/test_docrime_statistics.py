@@ -1,4 +1,4 @@
-"""DO-CRIME over many seeds: planted matrices and delays come back within their stated errors."""
+"""DO-CRIME over many seeds: injected matrices and delays are recovered within their stated errors."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ def run(seed, delay=2.0, pole=0.98, turbulence=0.3, noise=2e-3, poke=0.01, frame
     weights = np.asarray(RESPONSES[delay])
     seen = lfilter(weights, [1.0], pokes, axis=0)
     kicks = rng.standard_normal((frames + 300, N_SLOPES)) * np.sqrt(1 - pole**2)
-    air = lfilter([1.0], [1.0, -pole], kicks, axis=0)[300:]
-    slopes = seen @ truth.T + turbulence * air + rng.normal(0, noise, (frames, N_SLOPES))
+    red_noise = lfilter([1.0], [1.0, -pole], kicks, axis=0)[300:]
+    slopes = seen @ truth.T + turbulence * red_noise + rng.normal(0, noise, (frames, N_SLOPES))
     return slopes.astype(np.float32), pokes, truth
 
 
@@ -45,7 +45,7 @@ def split(s, truth):
 
 @pytest.mark.parametrize("delay", RESPONSES)
 @pytest.mark.parametrize("frames", [FRAMES, 3000])
-def test_planted_matrices_and_delays_are_recovered(delay, frames):
+def test_injected_matrices_and_delays_are_recovered(delay, frames):
     gains, errors, delays, weights = [], [], [], []
     for seed in range(8):
         slopes, pokes, truth = run(seed, delay, turbulence=0.1, frames=frames)
@@ -167,8 +167,8 @@ def test_lost_frames_bias_nothing(lost):
         on = np.searchsorted(kept, np.arange(frames), side="right") - 1
         held = np.where((on >= 0)[:, None], pokes[kept[np.maximum(on, 0)]], 0.0)
         seen = lfilter(RESPONSES[2.55], [1.0], held, axis=0)
-        air = lfilter([1.0], [1.0, -0.98], 0.06 * rng.standard_normal((frames, N_SLOPES)), axis=0)
-        slopes = (seen @ truth.T + air + rng.normal(0, 2e-3, air.shape)).astype(np.float32)
+        red_noise = lfilter([1.0], [1.0, -0.98], 0.06 * rng.standard_normal((frames, N_SLOPES)), axis=0)
+        slopes = (seen @ truth.T + red_noise + rng.normal(0, 2e-3, red_noise.shape)).astype(np.float32)
         s = solve(slopes[kept], pokes[kept], index=kept)
         assert s.lost_frames == kept[-1] - kept[0] + 1 - kept.size
         chi2.append(np.mean(((s.matrix - truth) / s.sigma) ** 2))

@@ -1,4 +1,4 @@
-"""The emulated stage turns the twin's beam: what the driver reaches over the wire is what the sensor sees."""
+"""The emulated stage turns the twin's beam: the driver's position is that of the beam on the sensor."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ SMALL = (
 
 
 def points(bench: System) -> np.ndarray:
-    """Where the twin's beam goes on the pyramid, lambda/D."""
+    """Position of the twin's beam on the pyramid, lambda/D."""
     return np.asarray(bench.wfs._bench.beam_path.points().points)
 
 

@@ -1,4 +1,4 @@
-"""The lenslet grid is found wherever it lies, and only where there is one."""
+"""The lenslet grid is located at any position, and refused where there is none."""
 
 from __future__ import annotations
 

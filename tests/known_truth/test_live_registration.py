@@ -114,8 +114,8 @@ def injected(truth, *more, seed):
     return System.from_config(configuration(*realisations, *more, seed=seed))
 
 
-def test_a_sheared_mirror_does_not_lean_the_registration():
-    """Shifts in % of a sub-aperture: they would take up part of a shear that nobody asked for."""
+def test_a_sheared_mirror_does_not_bias_the_registration():
+    """Shifts in % of a sub-aperture: they would take up part of a shear that is not fitted."""
     missed, blind = [], []
     for number in (1, 3):
         truth = random_registration(number)
@@ -131,7 +131,7 @@ def test_a_sheared_mirror_does_not_lean_the_registration():
             plain = looked(bench, 4, 500)[0]
         blind.append(errors_and_pulls(plain, truth)[0][:2])
         assert found.misfit < plain.misfit
-    # An error of 0.4 is stated for each of the four; the shear that nobody asked for makes 1.2 of them.
+    # An error of 0.4 is stated for each of the four; a shear that is not fitted gives 1.2.
     assert np.sqrt(np.mean(np.square(missed))) < 0.8
     assert np.sqrt(np.mean(np.square(blind))) > np.sqrt(np.mean(np.square(missed)))
 

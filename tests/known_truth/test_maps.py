@@ -1,4 +1,4 @@
-"""The telescope twins: what the sensor finds is where it was put, and the loop closes on a star."""
+"""The telescope twins: the images are located correctly, and the loop closes on a star."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from escape_sim.devices.bench import SimBench
 from escape_sim.devices.twins import SimAdaptiveSecondary
 from escape_sim.models.factory import make_fast_model
 
-#: Few modes on calm air keep this short; the faintest mode of so short a run is still well seen.
+#: Few modes and weak turbulence for a short test with a sufficient signal-to-noise ratio in every mode.
 FEW = [
     "basis.n_modes=20", "calibration.sprint_modes=20", "twin.atmosphere.r0_m=0.4", "calibration.frames=900",
 ]  # fmt: skip
@@ -51,7 +51,7 @@ def test_frames_are_faint_but_not_dark_nor_saturated(system):
     expected = twin(system).wfs_light(system.wfs.settings.exposure_s)[0]
     assert frame.n_saturated == 0
     assert electrons == pytest.approx(expected, rel=0.15)
-    # The arc that is soiled is darker than the one opposite.
+    # The contaminated arc is darker than the one opposite.
     passed = np.square(twin(system).pupil.amplitude, dtype=float)
     assert passed.sum() < 0.99 * (passed > 0).sum()
 
@@ -63,7 +63,7 @@ def test_pupils_are_found_where_they_are(system, found):
     assert np.abs((found.grid.centres_px - centres).mean(axis=0)).max() < 0.3
 
 
-def test_the_matrix_knows_the_hidden_registration(system, found):
+def test_the_matrix_has_the_hidden_registration(system, found):
     model = make_fast_model(system.config, found.grid)
     matrix = found.matrix
 
@@ -71,10 +71,10 @@ def test_the_matrix_knows_the_hidden_registration(system, found):
         want = model.zonal_matrix(registration) @ matrix.m2c
         return np.mean([np.corrcoef(a, b)[0, 1] for a, b in zip(want.T, matrix.data.T, strict=True)])
 
-    planted = system.config.twin.registration.to_registration()
-    flipped = Registration(*(-planted.to_array()))
-    assert likeness(planted) > 0.5
-    assert likeness(planted) > likeness(flipped)
+    injected = system.config.twin.registration.to_registration()
+    flipped = Registration(*(-injected.to_array()))
+    assert likeness(injected) > 0.5
+    assert likeness(injected) > likeness(flipped)
 
 
 def test_disabled_actuators_take_no_part(system, found):

@@ -1,4 +1,4 @@
-"""The focus that stands still, told from the turbulence's own, on screens that the wind carries past."""
+"""The static focus, separated from that of the turbulence, on screens moved by wind."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def errors() -> np.ndarray:
     return np.array(out).T
 
 
-def test_the_focus_that_stands_still_is_found(errors):
+def test_the_static_focus_is_recovered(errors):
     told, plain = np.sqrt(np.mean(np.square(errors), axis=1))
     assert told < plain / 3
     # Eight runs: no bias beyond three standard errors.
@@ -92,7 +92,7 @@ def test_what_the_wind_does_not_explain_is_left_as_it_was():
     )
 
 
-def test_a_short_run_and_calm_air_leave_it_open():
+def test_a_short_run_and_weak_turbulence_do_not_determine_it():
     assert watched(layer(1, 300, 0.0) + lattice())[0].static_focus() is None
     rng = np.random.default_rng(1)
     calm, slope_statistics = watched(lattice() + rng.normal(0, 0.05, (1000, lattice().size)))

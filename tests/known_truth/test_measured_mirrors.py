@@ -1,4 +1,4 @@
-"""SPRINT on matrices that a real ALPAO DM97 gave, which stand next to the project and not in it.
+"""SPRINT on matrices measured with a real ALPAO DM97, which are not part of the repository.
 
 Its influence functions are no Gaussians, so the share of the broad pedestal ends at its limit.
 """

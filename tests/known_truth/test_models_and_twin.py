@@ -1,4 +1,4 @@
-"""A synthetic model is the design's: whatever the twin hides, its matrix stays the same."""
+"""A synthetic model is nominal: its matrix does not depend on the true state of the twin."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Optical gains in closed loop on the small pyramid twin, against its own response around the residuals."""
+"""Optical gains in closed loop on the small pyramid twin, against the true response around the residuals."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from escape_hw.runtime.session.record import without_turbulence
 from escape_hw.runtime.session.system import System, open_system
 from escape_sim.devices.true_optical_gains import WavefrontRecorder, get_simulated_bench, true_optical_gains
 
-#: The small twin's light saturates pixels now and then, which the truth, made without a detector, lacks.
+#: The small twin's light saturates pixels occasionally; the true values are computed without a detector.
 DIM = "twin.wfs.photons_per_frame=1.5e6"
 POKE = 0.002
 
@@ -59,7 +59,7 @@ def scaled(result: CalibrationResult, factor: float) -> CalibrationResult:
 def measured(
     bench: System, result: CalibrationResult, frames: int, wavefronts: int, every: int = 1
 ) -> tuple[LoopSegment, np.ndarray]:
-    """Gains at the usual loop gain, and the truth of some modes and wavefronts meanwhile."""
+    """Gains at the usual loop gain, and the true values of some modes and wavefronts meanwhile."""
     loop, matrix = GainMeasurementLoop(bench, result, {}), result.matrix
     loop.control.set_gain(bench.config.loop.gain)
     watching = WavefrontRecorder(get_simulated_bench(bench), frames // wavefronts)
@@ -76,7 +76,7 @@ def measured(
 
 
 def assert_true(segment: LoopSegment, truth: np.ndarray, every: int = 1) -> None:
-    """Bias at most 1 % beside the stated error of the common scale, and errors of single modes honest."""
+    """Bias at most 1 % plus the stated error of the common scale, and correct errors of single modes."""
     assert segment.gains is not None
     value, sigma = segment.gains.value[0][::every], segment.gains.sigma[0][::every]
     mean, error = truth.mean(axis=0), truth.std(axis=0, ddof=1) / np.sqrt(len(truth))
@@ -104,7 +104,7 @@ def test_gains_of_the_bench_are_those_of_the_frozen_residuals() -> None:
         assert_true(*measured(bench, result, 6000, 40, every=6), every=6)
 
 
-def test_small_pokes_go_on_with_the_response_that_larger_ones_told(
+def test_small_pokes_use_the_response_measured_with_larger_ones(
     bench: System, baseline: CalibrationResult
 ) -> None:
     loop = GainMeasurementLoop(bench, baseline, {})
@@ -158,13 +158,13 @@ def test_bootstrap_converges_from_any_scale_to_the_same_matrix(
     assert np.median(levels[0.3] / levels[3.0]) == pytest.approx(1, abs=0.05)
 
 
-def test_a_matrix_of_the_wrong_sign_is_told(bench: System, baseline: CalibrationResult) -> None:
+def test_a_matrix_of_the_wrong_sign_is_reported(bench: System, baseline: CalibrationResult) -> None:
     with pytest.raises(CalibrationError, match=r"a sign is wrong"):
         bench.run(bootstrap_gains(bench, scaled(baseline, -1.0)))
     assert not bench.dm.shape.any()
 
 
-def test_a_mirror_out_of_the_beam_is_told(bench: System, baseline: CalibrationResult) -> None:
+def test_a_mirror_out_of_the_beam_is_reported(bench: System, baseline: CalibrationResult) -> None:
     shuffled = np.random.default_rng(0).permutation(baseline.matrix.n_slopes)
     other = replace(baseline, matrix=replace(baseline.matrix, data=baseline.matrix.data[shuffled]))
     with pytest.raises(CalibrationError, match=r"cannot be closed"):
@@ -172,7 +172,7 @@ def test_a_mirror_out_of_the_beam_is_told(bench: System, baseline: CalibrationRe
     assert not bench.dm.shape.any()
 
 
-def test_turbulence_beyond_the_sensor_is_told(baseline: CalibrationResult) -> None:
+def test_turbulence_beyond_the_sensor_is_reported(baseline: CalibrationResult) -> None:
     # The strongest screen, whose r0 is a seventh of an actuator's pitch.
     with small(DIM, "devices.screen.screen=0", "sensor.modulation=3.0") as bench:
         with pytest.raises(CalibrationError, match=r"does not close|cannot be closed|stay closed"):
@@ -249,7 +249,9 @@ def test_another_matrix_lends_its_shape(
     assert np.median(gains_of(run).best) > 1
 
 
-def test_only_a_matrix_of_the_model_has_a_shape_at_rest(bench: System, baseline: CalibrationResult) -> None:
+def test_only_a_matrix_of_the_model_has_a_shape_for_a_flat_wavefront(
+    bench: System, baseline: CalibrationResult
+) -> None:
     assert static_light_matrix(bench, baseline) is None
     # Lenslets answer alike at rest.
     assert static_light_matrix(bench, fake.calibration()) is None

@@ -26,7 +26,7 @@ from escape_sim.optics.modulation import ModulationPath
 from escape_sim.optics.pyramid import Prism, PyramidOptics, frequencies
 
 WAVELENGTH = 635e-9
-PLANTED = Registration(62.0, -138.0, 0.9, -1.7, 0.8)
+INJECTED = Registration(62.0, -138.0, 0.9, -1.7, 0.8)
 
 
 # ------------------------------------------------------------------ derivatives by the phase
@@ -184,7 +184,7 @@ VARIETIES = {
 @pytest.mark.parametrize("variety", VARIETIES)
 def test_matrices_equal_those_of_oopao(variety):
     config = configuration(*VARIETIES[variety])
-    for registration, width in ((Registration(), 1.0), (PLANTED, 1.1)):
+    for registration, width in ((Registration(), 1.0), (INJECTED, 1.1)):
         ours, theirs = (
             module(config, None).zonal_matrix(registration, width)
             for module in (make_fast_model, oopao_model.make_oopao_model)
@@ -229,21 +229,21 @@ def model():
 def test_modes_and_derivatives_are_those_of_the_zonal_matrix(model):
     assert isinstance(model, DifferentiableModel)
     m2c = np.random.default_rng(2).standard_normal((model.n_act, 6))
-    zonal = model.zonal_matrix(PLANTED, 1.05)
-    modal, by = model.modal_jacobian(PLANTED, m2c, 1.05)
-    assert np.abs(model.modal_matrix(PLANTED, m2c, 1.05) - zonal @ m2c).max() < 1e-5 * np.abs(modal).max()
+    zonal = model.zonal_matrix(INJECTED, 1.05)
+    modal, by = model.modal_jacobian(INJECTED, m2c, 1.05)
+    assert np.abs(model.modal_matrix(INJECTED, m2c, 1.05) - zonal @ m2c).max() < 1e-5 * np.abs(modal).max()
     assert np.abs(modal - zonal @ m2c).max() < 1e-5 * np.abs(modal).max()
-    zonal_too, zonal_by = model.zonal_jacobian(PLANTED, 1.05)
+    zonal_too, zonal_by = model.zonal_jacobian(INJECTED, 1.05)
     assert np.abs(zonal_too - zonal).max() < 1e-5 * np.abs(zonal).max()
     for k, step in enumerate((1.0, 1.0, 0.1, 0.3, 0.3)):
         d = np.eye(5)[k] * step
         sides = [
-            model.zonal_matrix(Registration.from_array(PLANTED.to_array() + s * d), 1.05) for s in (1, -1)
+            model.zonal_matrix(Registration.from_array(INJECTED.to_array() + s * d), 1.05) for s in (1, -1)
         ]
         want = (sides[0] - sides[1]) / (2 * step)
         assert np.abs(zonal_by[k] - want).max() < 2e-3 * np.abs(want).max()
         assert np.abs(by[k] - want @ m2c).max() < 2e-3 * np.abs(want @ m2c).max()
-    want = (model.zonal_matrix(PLANTED, 1.06) - model.zonal_matrix(PLANTED, 1.04)) / 0.02
+    want = (model.zonal_matrix(INJECTED, 1.06) - model.zonal_matrix(INJECTED, 1.04)) / 0.02
     assert np.abs(zonal_by[5] - want).max() < 2e-3 * np.abs(want).max()
     assert np.abs(by[5] - want @ m2c).max() < 2e-3 * np.abs(want @ m2c).max()
 
@@ -262,7 +262,7 @@ def test_turbulence_takes_response_away_and_not_evenly():
 
 
 @pytest.mark.parametrize("ratio", [1.0, 4.0, 8.0])
-def test_the_motion_of_the_slopes_tells_the_strength(ratio):
+def test_the_motion_of_the_slopes_gives_the_strength(ratio):
     config = configuration()
     model = PyramidModel(config, nominal_pupils(config))
     pupils, optics = nominal_pupils(config), model.optics()
@@ -290,8 +290,8 @@ def test_motion_beyond_the_most_is_as_strong_as_the_most():
 
 
 def test_variants_differ_in_turbulence_modulation_and_the_place_of_the_images(model):
-    here = model.zonal_matrix(PLANTED)
-    matrices = [v.zonal_matrix(PLANTED) for v in model.variants()]
+    here = model.zonal_matrix(INJECTED)
+    matrices = [v.zonal_matrix(INJECTED) for v in model.variants()]
     assert len(matrices) == 5
     for one in matrices:
         assert 1e-3 < np.linalg.norm(one - here) / np.linalg.norm(here) < 0.5
@@ -301,7 +301,7 @@ def test_variants_differ_in_turbulence_modulation_and_the_place_of_the_images(mo
     assert (x - 1) * (y - 1) < 0
 
 
-def test_a_sensor_at_rest_has_no_variants_of_its_modulation():
+def test_a_sensor_without_turbulence_has_no_variants_of_its_modulation():
     config = configuration("sensor.modulation=0")
     assert len(PyramidModel(config, nominal_pupils(config)).variants()) == 2
 
@@ -313,11 +313,11 @@ def test_images_that_were_misplaced_by_diagonals_are_no_shift():
     real = PyramidModel(config, replace(pupils, centres_px=pupils.centres_px + diagonals), turbulence=4.0)
     model = PyramidModel(config, pupils, turbulence=4.0)
     modes = np.random.default_rng(2).standard_normal((model.n_act, 60))
-    seen = real.modal_matrix(PLANTED, modes)
-    here, moved = model.modal_jacobian(PLANTED, modes)
+    seen = real.modal_matrix(INJECTED, modes)
+    here, moved = model.modal_jacobian(INJECTED, modes)
 
     def shift(beside):
-        terms = np.stack([here, *moved, *(v.modal_matrix(PLANTED, modes) - here for v in beside)])
+        terms = np.stack([here, *moved, *(v.modal_matrix(INJECTED, modes) - here for v in beside)])
         flat = terms.reshape(len(terms), -1)
         shares = np.linalg.solve(flat @ flat.T, flat @ seen.ravel())
         return shares[1:3] / shares[0], shares[-2:] / shares[0]
@@ -331,11 +331,11 @@ def test_images_that_were_misplaced_by_diagonals_are_no_shift():
     assert apart == pytest.approx([1.2, -0.8], abs=0.15)
 
 
-def test_found_images_count_and_not_the_design():
+def test_located_images_are_used_and_not_the_design():
     config = configuration()
     pupils = nominal_pupils(config)
     moved = replace(pupils, centres_px=pupils.centres_px + np.array([[0.4, -0.3], [0, 0], [0, 0.2], [0, 0]]))
-    one, two = (PyramidModel(config, p).zonal_matrix(PLANTED) for p in (pupils, moved))
+    one, two = (PyramidModel(config, p).zonal_matrix(INJECTED) for p in (pupils, moved))
     assert np.linalg.norm(one - two) > 1e-3 * np.linalg.norm(one)
 
 

@@ -200,7 +200,7 @@ def test_a_positive_slope_sends_the_light_to_higher_columns_and_rows(build):
         )
 
 
-def test_images_stand_where_they_should_and_upright():
+def test_images_are_at_their_positions_and_upright():
     # Light far out on one face makes one full image of the pupil.
     pupil = beam(64)
     pupil[:32, :20] = 0

@@ -1,4 +1,4 @@
-"""Pupil images with known places: found to a tenth of a pixel, or refused with a reason."""
+"""Pupil images at known positions: located to a tenth of a pixel, or refused with a reason."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def test_valid_pixels_are_those_with_light() -> None:
     assert np.median(found.flux[found.valid]) == pytest.approx(1, abs=0.01)
 
 
-def test_a_longer_look_moves_centres_and_nothing_else() -> None:
+def test_a_longer_recording_moves_centres_and_nothing_else() -> None:
     rng = np.random.default_rng(4)
     centres = moved(rng)
     first = find(frame(centres, rng, strength=0.5, noise=5.0))
@@ -90,7 +90,7 @@ def test_a_longer_look_moves_centres_and_nothing_else() -> None:
     assert better.references is first.references
 
 
-def test_parts_of_a_run_tell_the_error_of_the_images_place() -> None:
+def test_parts_of_a_run_give_the_error_of_the_images_position() -> None:
     pulls = []
     for seed in range(6):
         rng = np.random.default_rng(seed)

@@ -1,4 +1,4 @@
-"""The registration against injected values that the estimators never see."""
+"""The registration against injected values that no estimator reads."""
 
 from __future__ import annotations
 
@@ -61,14 +61,14 @@ def test_no_error_is_beyond_what_its_sigma_allows(few: Sequence[RealisationError
     assert 0.2 < np.mean(pulls[:, 1] ** 2) < 3
 
 
-def test_no_estimate_beats_the_bound_and_none_claims_to(few: Sequence[RealisationErrors]) -> None:
+def test_no_error_and_no_stated_error_is_below_the_bound(few: Sequence[RealisationErrors]) -> None:
     for plant in few:
         assert (plant.sigmas[1, 0] > plant.exact[0]).all()
 
 
 @pytest.mark.slow
 def test_thirty_registrations_short_and_two_seconds() -> None:
-    """The paper's SHORT run and a tenth of it: accurate, and honest about it in every parameter."""
+    """The paper's SHORT run and a tenth of it: accurate, with correct errors of every parameter."""
     curves = run(sky_time(SYSTEM, realisations=30, frames=(1000, 10_000)))
     for estimator in ("whitened", "telemetry"):
         for frames in (1000, 10_000):

@@ -1,4 +1,4 @@
-"""A matrix that was saved and read back is worth as much as the one in memory."""
+"""A matrix that was saved and read back is equivalent to the one in memory."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Slopes of a pyramid that answer more towards the rim than its model says, against injected values."""
+"""Slopes of a pyramid whose gain increases towards the rim, against injected values."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def unit_trends(model: PyramidModel) -> NDArray[np.float64]:
 def measured(
     model: PyramidModel, seed: int, trend: NDArray[np.float64], noise: float = NOISE
 ) -> tuple[InteractionMatrix, Registration]:
-    """A matrix of unequal actuators and slopes, whose neighbours share their noise, and the truth."""
+    """A matrix of unequal actuators and slopes, with correlated noise of neighbours, and the true values."""
     rng, valid = np.random.default_rng(seed), nominal_pupils(small_pyramid()).valid
     truth = Registration(*(rng.uniform(-1, 1, 5) * [20, 20, 0.5, 1.5, 1.5]))
     zonal_matrix = model.zonal_matrix(truth) * (1 + 0.05 * rng.standard_normal(model.n_act))
@@ -75,7 +75,7 @@ def error_of(fit: SprintFit, truth: Registration) -> NDArray[np.float64]:
     return fit.estimate.registration.to_array() - truth.to_array()
 
 
-def test_a_injected_trend_is_found(model: PyramidModel) -> None:
+def test_an_injected_trend_is_recovered(model: PyramidModel) -> None:
     pulls, shapes = [], []
     terms = np.column_stack([np.ones(len(unit_trends(model))), unit_trends(model)])
     for seed in SEEDS:
@@ -91,7 +91,7 @@ def test_a_injected_trend_is_found(model: PyramidModel) -> None:
     assert np.mean(np.square(pulls)) < 2.0
 
 
-def test_a_trend_does_not_pass_for_a_scaling(model: PyramidModel) -> None:
+def test_a_trend_is_not_fitted_as_a_scaling(model: PyramidModel) -> None:
     # The same noise and the same mirror, with and without a trend.
     def moved(one: object) -> NDArray[np.float64]:
         found = []

@@ -1,4 +1,4 @@
-"""The fast model's matrix is the derivative of what the optics and the centre of gravity really do."""
+"""The fast model's matrix is the derivative of the simulated optics and centre of gravity."""
 
 from __future__ import annotations
 
@@ -212,7 +212,9 @@ def test_a_blurred_spot_follows_a_tilt_as_a_sharp_one_does():
     config = load_system("razor-shwfs", overrides=["sensor.n_sub=12", "devices.wfs.region=[220,156,200,200]"])
     grid = replace(nominal_grid(config), counts=2500.0, motion_px=0.9)
     pupil = pupil_geometry(config)
-    still, blurred = (slope_weights(config, replace(grid, turbulence_px=air), pupil) for air in (0.0, 0.7))
+    still, blurred = (
+        slope_weights(config, replace(grid, turbulence_px=turbulence), pupil) for turbulence in (0.0, 0.7)
+    )
     near = np.abs(blurred[0, 0] - still[0, 0]).max() / np.abs(still[0, 0]).max()
     # It changes the answer, and not by much.
     assert 0.01 < near < 1

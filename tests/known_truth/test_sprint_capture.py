@@ -1,4 +1,4 @@
-"""From how far SPRINT finds home, and that it says so when it does not."""
+"""Capture range of SPRINT, and its report when it does not converge."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def matrix_at(model: ShackHartmannModel) -> Callable[[Registration], Interaction
     ],
     ids=str,
 )
-def test_finds_home_from_afar(model, matrix_at, injected):
+def test_converges_from_large_misregistrations(model, matrix_at, injected):
     estimate = sprint(matrix_at(injected), model)
     assert estimate.converged
     error = estimate.registration.to_array() - injected.to_array()
@@ -64,7 +64,7 @@ def test_finds_home_from_afar(model, matrix_at, injected):
     assert estimate.chi2 == pytest.approx(1.0, abs=0.1)
 
 
-def test_a_shift_by_more_than_a_pitch_is_not_passed_off_as_found(model, matrix_at):
+def test_a_shift_by_more_than_a_pitch_is_not_reported_as_converged(model, matrix_at):
     injected = Registration(shift_x=400.0)
     estimate = sprint(matrix_at(injected), model, max_iterations=10, coarse_search=False)
     assert not estimate.converged
@@ -94,7 +94,7 @@ def test_two_pitches_away_turned_and_scaled(model, matrix_at, solver):
 
 
 @pytest.mark.parametrize("n_modes", [5, 40])
-def test_plants_at_random_are_found_or_refused(model, matrix_at, n_modes):
+def test_random_registrations_are_recovered_or_refused(model, matrix_at, n_modes):
     """Anywhere within three pitches and far beyond: what is called converged is right."""
     found = 0
     for number in range(6):
@@ -121,7 +121,7 @@ def test_high_modes_alone_are_found_by_many_starts(model, matrix_at):
     ).converged
 
 
-def test_light_and_full_agree_on_a_mirror_like_the_model(model, matrix_at):
+def test_both_solvers_agree_on_a_mirror_like_the_model(model, matrix_at):
     matrix = matrix_at(PAPER)
     light, full = (sprint(matrix, model, solver=s) for s in ("registration-only", "mixed-effects"))
     assert light.converged
@@ -132,7 +132,7 @@ def test_light_and_full_agree_on_a_mirror_like_the_model(model, matrix_at):
     assert abs(light.gain.value - 1) < 4 * light.gain.sigma
 
 
-def test_a_slow_learner_arrives_too(model, matrix_at):
+def test_a_small_learning_rate_converges(model, matrix_at):
     estimate = sprint(matrix_at(PAPER), model, solver="registration-only", learning_rate=0.5)
     assert estimate.converged
     assert (np.abs(estimate.registration.to_array() - PAPER.to_array()) < 4 * estimate.sigma).all()

@@ -1,4 +1,4 @@
-"""Scatter that SPRINT learns, sub-apertures that it distrusts, and options that it refuses."""
+"""Prior variances estimated by SPRINT, outlying sub-apertures, and refused options."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_the_scatter_of_the_random_effects_is_learned(bench, actuators, slopes):
     assert priors.slope_gain == pytest.approx(slopes, rel=0.45)
 
 
-def test_the_matrix_that_was_found_is_that_of_the_mirror_at_hand(bench):
+def test_the_fitted_matrix_is_that_of_the_true_mirror(bench):
     model, _, m2c = bench
     matrix = measured(bench, noise=0.02, actuators=0.1)
     exact = measured(bench, noise=0.0, actuators=0.1).data
@@ -70,7 +70,7 @@ def test_the_matrix_that_was_found_is_that_of_the_mirror_at_hand(bench):
 
 
 @pytest.mark.parametrize("solver", ["mixed-effects", "registration-only"])
-def test_hubers_loss_finds_home_among_bad_sub_apertures(bench, solver):
+def test_hubers_loss_converges_with_bad_sub_apertures(bench, solver):
     model = bench[0]
     matrix = measured(bench, noise=0.02)
     n = matrix.n_slopes // 2
@@ -104,7 +104,7 @@ def test_informative_modes_beat_the_first_ones(bench):
         choose_modes(matrix, 6, "d-optimal")
 
 
-def test_a_descent_of_small_steps_that_was_cut_has_not_converged(bench):
+def test_an_iteration_of_small_steps_that_reached_its_limit_has_not_converged(bench):
     matrix = measured(bench, noise=0.3)
     cut = sprint(matrix, bench[0], learning_rate=0.01, coarse_search=False, max_iterations=3)
     assert not cut.converged

@@ -63,7 +63,7 @@ def test_a_perfect_image_has_strehl_one(model):
 
 
 @pytest.mark.parametrize("sigma", [0.1, 0.2, 0.3])
-def test_small_aberrations_obey_marechal(plane, model, sigma):
+def test_small_aberrations_follow_marechal(plane, model, sigma):
     # Averaged over realisations: exp(-sigma^2) is exact only for Gaussian phase.
     found = np.mean([strehl_ratios(plane.image(aberration(sigma, seed)), model) for seed in range(8)], axis=0)
     assert found[:2] == pytest.approx(np.full(2, np.exp(-(sigma**2))), abs=0.1 * sigma**2 + 1e-3)
@@ -174,7 +174,7 @@ def test_errors_shrink_with_the_root_of_the_number_of_frames(plane, model):
     assert 1.5 < np.mean(few) / np.mean(many) < 4.2
 
 
-def test_errors_are_honest(model):
+def test_errors_are_correct(model):
     # Frames of the model whose peaks scatter by a known amount.
     found, small = [], model[40:88, 40:88]
     for seed in range(60):

@@ -1,4 +1,4 @@
-"""Stated errors of Strehl ratios against their scatter over stretches of a closed loop on the twin."""
+"""Stated errors of Strehl ratios against their scatter over intervals of a closed loop on the twin."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The registration straight from telemetry, against injected values and against the matrix route."""
+"""The registration from telemetry, against injected values and the fit to the matrix."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def fifty() -> list[tuple[np.ndarray, CalibrationResult]]:
     return [_calibrate(number, 50) for number in (0, 1, 2)]
 
 
-def test_a_tenth_of_a_second_meets_the_goal_on_every_plant(fifty):
+def test_a_tenth_of_a_second_meets_the_goal_on_every_realisation(fifty):
     for errors, result in fifty:
         assert (np.abs(errors) <= 2 * GOAL).all(), errors
         assert result.frames <= 50

@@ -1,22 +1,24 @@
-"""The temporal response, and the gain that it gives a matrix, where the first frames tell little of it."""
+"""The temporal response, and the gain of the matrix, where the first frames carry little information."""
 
 from __future__ import annotations
 
 import numpy as np
-import planted_loop as planted
 import pytest
+import simulated_loop as simulated
 
 from escape_hw.calibration.docrime.response import LagSums, ResponseEstimate
 
 SEEDS = 16
 
 
-@pytest.mark.parametrize("gain", [0.4, np.linspace(0.05, 0.6, planted.N_MODES)], ids=["one", "of each mode"])
+@pytest.mark.parametrize(
+    "gain", [0.4, np.linspace(0.05, 0.6, simulated.N_MODES)], ids=["one", "of each mode"]
+)
 def test_weak_first_frames_do_not_spoil_the_gain(gain):
     """Pokes so weak that the first thousand frames may miss the gain by any factor."""
     gains, stated, pulls = [], [], []
     for seed in range(SEEDS):
-        run = planted.loop(seed, frames=5000, poke=0.004, gain=gain)
+        run = simulated.loop(seed, frames=5000, poke=0.004, gain=gain)
         found = run.fit()
         size = np.square(run.truth).sum()
         own = np.sqrt(np.square(found.sigma * run.truth).sum()) / size
@@ -56,7 +58,7 @@ def test_instruments_and_their_errors():
     assert np.mean(np.square(pulls)) == pytest.approx(1, abs=0.3)
 
 
-def test_estimates_are_weighed_by_their_covariances():
+def test_estimates_are_weighted_by_their_covariances():
     free = np.array([[1.0, -1.0, 0.0], [0.0, 1.0, -1.0]]).T
     good = ResponseEstimate(np.array([0.2, 0.6, 0.2]), free @ np.diag([1e-4, 4e-4]) @ free.T)
     poor = ResponseEstimate(np.array([0.9, -0.7, 0.8]), 99 * good.covariance)

@@ -1,4 +1,4 @@
-"""Slow drift of the twins: it does what the configuration says, and no model or estimator sees it."""
+"""Slow drift of the twins: it follows the configuration, and no model or estimator reads it."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def test_the_surface_is_that_of_the_registration_of_the_moment():
     np.testing.assert_array_equal(again(command, 1.2), moving(command, 1.2))
 
 
-def test_a_bench_that_stands_still_is_derived_once(monkeypatch):
+def test_a_bench_without_drift_is_computed_once(monkeypatch):
     twin = bench()
     monkeypatch.setattr(
         "escape_sim.mirror.surface.make_mirror_surface", lambda *_: pytest.fail("derived again")
@@ -107,7 +107,7 @@ def test_turbulence_over_a_telescope_changes_too():
 
 
 @pytest.mark.parametrize("load", [lambda *more: load_system("razor-shwfs", overrides=more), pyramid])
-def test_models_know_nothing_of_it(load):
+def test_models_do_not_use_it(load):
     words = ("twin.drift.rate.shift_x=30.0", "twin.drift.swing.rotation=5.0", "twin.seeing.rate=-0.02")
     registration = Registration(shift_x=3.0)
     with System.from_config(load()) as system:

@@ -1,4 +1,4 @@
-"""What importing loads, and what it must not."""
+"""Modules that an import loads, and those that it must not."""
 
 import json
 import subprocess

@@ -1,4 +1,4 @@
-"""The wheel, installed outside the checkout: an editable install would hide what is missing."""
+"""The wheel, installed outside the checkout: an editable install would hide missing files."""
 
 import json
 import os

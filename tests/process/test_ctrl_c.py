@@ -1,4 +1,4 @@
-"""Ctrl-C in the middle of each procedure: exit code 130 within a second, partial data under such a name."""
+"""Ctrl-C in the middle of each procedure: exit code 130 within a second, partial data saved."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ def test_ctrl_c_while_sprint_computes(start, tmp_path):
     assert load_matrix(out / "im.partial.fits").matrix.method == "docrime-whitened"
 
 
-def test_ctrl_c_tells_the_command_that_goes_on(start, system, tmp_path):
+def test_ctrl_c_prints_the_command_to_resume(start, system, tmp_path):
     first, second = tmp_path / "a run", tmp_path / "again"
     running = start("calibrate", system, "--method", "docrime", "--frames", ENDLESS, "--out", first)
     running.wait_for("DO-CRIME")

@@ -1,4 +1,4 @@
-"""Killed without warning, a calibration goes on where its last state was."""
+"""A killed calibration is resumed from its last state."""
 
 from __future__ import annotations
 
@@ -41,5 +41,5 @@ def test_kill_9_and_resume(start, system, tmp_path):
     matrix = load_matrix(second / "im.fits").matrix
     assert matrix.method == "docrime-whitened"
     assert matrix.metrics["poke"] == 0.01
-    # It came to its end: there is nothing to go on with.
+    # The run is complete: there is nothing to resume.
     assert not (second / "run.state").exists()

@@ -1,4 +1,4 @@
-"""The benchmark of the loop's latency: both sides of it answer every frame, and nothing stays behind."""
+"""The benchmark of the loop's latency: both packages process every frame, and no process remains."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def test_every_rule_of_the_guard_is_in_the_way():
         assert len(mirror.times) == 1
 
 
-def test_rows_tell_losses_and_a_peer_that_failed():
+def test_rows_show_losses_and_a_peer_that_failed():
     case = latency.make_case(4, 8, 12, 200.0)
     ours = LatencyResult(np.arange(1.0, 101.0), 200.0, 3, ("no real-time priority",))
     rows = latency._rows(case, ours, LatencyResult(np.array([150.0, 400.0]), 180.0, 0))

@@ -1,4 +1,4 @@
-"""Telemetry on disk: every entry in order, or counted as dropped; a slow or full disk delays nothing."""
+"""Telemetry on disk: every entry in order, or counted as dropped; a slow or full disk delays no loop."""
 
 from __future__ import annotations
 
@@ -168,7 +168,7 @@ def test_half_a_block_is_taken_back_when_the_disk_is_full(tmp_path):
     assert (len(part.data), part.complete) == (10 * complete, True)
 
 
-def test_damage_is_told(tmp_path, writer):
+def test_damage_is_reported(tmp_path, writer):
     recorded(tmp_path, writer, lambda: entries(writer, 0, 50))
     content = (tmp_path / "slopes.blocks").read_bytes()
     (tmp_path / "cut.blocks").write_bytes(content[: len(content) - 5])
@@ -224,7 +224,7 @@ def test_a_process_ends_with_its_streams(tmp_path):
     assert state.fault == ""
 
 
-def test_a_process_that_cannot_begin_says_so(tmp_path, capfd):
+def test_a_process_that_cannot_begin_is_reported(tmp_path, capfd):
     recorder = RecorderProcess(tmp_path, {"slopes": segment_name(SYSTEM, "absent")})
     _until(lambda: not recorder.running)
     assert "the recorder ended with code" in recorder.stop().fault
@@ -264,7 +264,7 @@ def test_the_command_shows_what_flows(writer, capsys):
     assert f"{SYSTEM} slopes" in " ".join(capsys.readouterr().out.split())
 
 
-def test_the_command_clears_up_after_the_dead_only(writer, capsys):
+def test_the_command_removes_segments_of_ended_processes_only(writer, capsys):
     script = f"""
 import os, signal
 from escape_hw.streams.ring import RingWriter

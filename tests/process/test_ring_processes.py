@@ -1,4 +1,4 @@
-"""Rings between processes: no torn reads and no leaks, whichever process dies."""
+"""Rings between processes: no torn reads and no leaks, whichever process ends."""
 
 from __future__ import annotations
 

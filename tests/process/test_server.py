@@ -202,7 +202,7 @@ def test_a_closed_loop_run_and_its_result(bench: Connection, matrix: str) -> Non
     assert result.stable
 
 
-def test_a_halted_run_has_a_flat_mirror_and_goes_on(bench: Connection) -> None:
+def test_a_halted_run_has_a_flat_mirror_and_continues(bench: Connection) -> None:
     run = bench.start("docrime", frames=4000)
     wait_for(lambda: bench.state.active_run is not None and bench.state.active_run.completed > 300, "frames")
     bench.pause()
@@ -215,7 +215,7 @@ def test_a_halted_run_has_a_flat_mirror_and_goes_on(bench: Connection) -> None:
     assert float(np.median(result.matrix.snr())) > 5
 
 
-def test_a_check_tells_frames_time_and_stroke_and_moves_nothing(bench: Connection) -> None:
+def test_a_check_gives_frames_time_and_stroke_and_moves_nothing(bench: Connection) -> None:
     plan = bench.plan("escape", {"frames": 1500})
     assert plan.frames == 1500
     assert plan.seconds == pytest.approx(3.0)
@@ -231,7 +231,7 @@ def test_a_check_tells_frames_time_and_stroke_and_moves_nothing(bench: Connectio
         bench.plan("escape", {"poke": 3.0})
 
 
-def test_a_failed_run_says_why_and_the_server_goes_on(bench: Connection) -> None:
+def test_a_failed_run_gives_the_reason_and_the_server_continues(bench: Connection) -> None:
     run = bench.start("docrime", frames=20)
     with pytest.raises(Exception, match="20 frames cannot constrain 30 modes"):
         run.wait(60)

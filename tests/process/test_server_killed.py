@@ -1,4 +1,4 @@
-"""kill -9 of engine and front: the mirror behind the real drivers ends flat, and nothing half is left."""
+"""kill -9 of engine and front: the mirror is flattened, and no partial product remains."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def test_the_fail_safe_process_flattens_the_mirror_of_a_killed_engine(system, be
         assert client.state.phase is Phase.FAULT
         assert not segments(pid=running)
         whole(tmp_path)
-        # The accumulators were kept, and the next engine goes on with them.
+        # The accumulators were kept, and the next engine continues with them.
         client.clear_fault()
         until_idle(client)
         (state,) = tmp_path.rglob("run.state")

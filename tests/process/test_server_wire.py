@@ -1,4 +1,4 @@
-"""Clients that misbehave: garbage, floods, half messages, death. They are refused, and nothing stops."""
+"""Misbehaving clients: invalid, too many or partial messages, sudden ends. The server continues."""
 
 from __future__ import annotations
 
@@ -169,7 +169,7 @@ with connect(sys.argv[1]) as bench:
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
-def test_a_client_that_dies_or_hangs_is_not_noticed_by_the_loop(
+def test_a_client_that_ends_or_hangs_is_not_noticed_by_the_loop(
     served: Served, bench: Connection, number: int
 ) -> None:
     if not bench.state.products:
@@ -195,7 +195,7 @@ def test_a_client_that_dies_or_hangs_is_not_noticed_by_the_loop(
     wait_for(lambda: bench.state.phase is Phase.IDLE, "idle")
 
 
-def test_from_afar_the_samples_come_over_the_wire(bench: Connection) -> None:
+def test_on_another_computer_the_samples_come_through_requests(bench: Connection) -> None:
     with connect(f"tcp://127.0.0.1:{PORT}") as far:
         wait_for(lambda: far.latest("frames") is not None, "a frame")
         sample = far.latest("frames")

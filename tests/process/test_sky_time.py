@@ -1,4 +1,4 @@
-"""A campaign with processes that die."""
+"""A campaign with processes that are killed."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def _stand_in(monkeypatch):
     monkeypatch.setattr(campaign, "run_realisation", realisation)
 
 
-def test_a_killed_process_ends_the_campaign_and_finished_realisations_are_kept(tmp_path):
+def test_a_killed_process_ends_the_campaign_and_finished_realisations_are_saved(tmp_path):
     curves = run(sky_time("razor-shwfs", realisations=8, frames=FRAMES, overrides=[str(tmp_path), "3"]))
     assert 1 <= curves["realisations"] <= 3
     assert (
@@ -65,7 +65,7 @@ def test_a_campaign_without_accidents_has_no_note(tmp_path):
     assert "note" not in curves
 
 
-def test_stopped_it_keeps_the_finished_realisations(tmp_path):
+def test_when_stopped_it_saves_the_finished_realisations(tmp_path):
     stop = threading.Event()
 
     def watch(progress: Any) -> None:

@@ -109,7 +109,7 @@ def test_a_wrong_command_stays_one(bare, words, end):
 
 @pytest.mark.parametrize("bare", ["buffered"], indirect=True)
 @pytest.mark.parametrize("end", ["full", "pipe"])
-def test_a_run_whose_progress_nobody_reads_is_finished(bare, system, tmp_path, end):
+def test_a_run_whose_progress_is_not_read_is_finished(bare, system, tmp_path, end):
     """It takes long enough for many lines of progress."""
     nobody = without_reader() if end == "pipe" else os.open("/dev/full", os.O_WRONLY)
     words = ("calibrate", system, "--method", "docrime", "--frames", 300, "--out", tmp_path / "run")

@@ -1,4 +1,4 @@
-"""A disk that takes no more: told in one line, nothing half written, the mirror safe first."""
+"""A full disk: one line of error, no partial file, the mirror made safe first."""
 
 from __future__ import annotations
 

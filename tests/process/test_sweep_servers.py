@@ -1,4 +1,4 @@
-"""Sweeps over real servers that are killed on the way. Slow, and skipped where a server is not installed."""
+"""Sweeps over real servers that are killed during the sweep. Slow; skipped where a server is missing."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def test_two_runners_share_a_postgresql_that_is_killed(arguments, postgres, tmp_
 
 
 @pytest.mark.skipif(importlib.util.find_spec("distributed") is None, reason="pip install 'escape-hw[dask]'")
-def test_a_sweep_outlives_its_dask_workers_and_scheduler(arguments, dask, tmp_path):
+def test_a_sweep_survives_its_dask_workers_and_scheduler(arguments, dask, tmp_path):
     run = tmp_path / "run"
     database = run / "study.db"
     sweep = start(*arguments, "--scheduler", dask.address, "--out", str(run))

@@ -1,4 +1,4 @@
-"""Worker processes that die are replaced; those that die again and again are given up."""
+"""Worker processes that end are replaced; after repeated failures the sweep gives up."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def die_once(mark: str) -> str:
     os._exit(1)
 
 
-def test_a_call_whose_worker_dies_is_made_again(workers, tmp_path):
+def test_a_call_whose_worker_ends_is_made_again(workers, tmp_path):
     assert workers.run(die_once, str(tmp_path / "mark")) == "done"
 
 

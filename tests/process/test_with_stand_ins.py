@@ -20,7 +20,7 @@ REGION = "devices.wfs.region=[216,152,208,208]"
 
 @pytest.fixture(autouse=True)
 def _compiled() -> None:
-    """Skip where there is no compiler, and say so."""
+    """Skip where there is no compiler, and report it."""
     try:
         for name in LIBRARIES:
             build_library(name)
@@ -50,7 +50,7 @@ def test_the_commands_exit_code_is_passed_on(escape, system: Path) -> None:
     assert "error: no-such-command: No such file or directory" in missing.stderr
 
 
-def test_without_a_command_it_tells_the_environment_and_serves_until_stopped(
+def test_without_a_command_it_prints_the_environment_and_serves_until_stopped(
     environment, system: Path
 ) -> None:
     with subprocess.Popen(

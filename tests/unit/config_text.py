@@ -1,4 +1,4 @@
-"""Wrong configurations, and what is said about them."""
+"""Wrong configurations and their error messages."""
 
 from __future__ import annotations
 

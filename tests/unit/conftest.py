@@ -1,4 +1,4 @@
-"""What the tests of the command line share: fake devices, and ways to call it."""
+"""Common fixtures of the command-line tests: fake devices, and functions to call it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A small mirror for the tests of the guard, and its rules written out again from their definitions."""
+"""A small mirror for the tests of the guard, and an independent implementation of its rules."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""An adaptive secondary follows commands while it runs, and a fault stays until somebody ends it."""
+"""An adaptive secondary follows commands while it runs, and a fault is latched until it is cleared."""
 
 from __future__ import annotations
 
@@ -156,7 +156,7 @@ def test_a_step_that_fails_is_reported() -> None:
         mirror.open()
 
 
-def test_nobody_goes_to_a_fault() -> None:
+def test_no_request_leads_to_a_fault() -> None:
     with twin() as mirror, pytest.raises(ValueError, match="choose off"):
         mirror.go_to(ShellState.FAULT)
 

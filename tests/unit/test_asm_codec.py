@@ -1,4 +1,4 @@
-"""The adaptive secondary's codec: known bytes, and whatever may arrive in whatever pieces."""
+"""The adaptive secondary's codec: known bytes, and arbitrary input in arbitrary fragments."""
 
 from __future__ import annotations
 
@@ -156,7 +156,7 @@ def test_no_damaged_frame_is_ever_a_reply(data: bytes, where: int, damage: int) 
         assert codec.feed(spoiled) == []
     except m.ProtocolError:
         with pytest.raises(m.ProtocolError):
-            codec.feed(data)  # nothing after it is believed
+            codec.feed(data)  # nothing after it is used
 
 
 @settings(deadline=None)

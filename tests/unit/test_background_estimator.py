@@ -1,4 +1,4 @@
-"""The estimator beside a loop: every frame once and in order, errors surface, and a loop need not wait."""
+"""The estimator in a background thread: every frame once and in order, errors raised."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_every_frame_arrives_once_and_in_order(frames):
     assert beside.skipped == 0
 
 
-def test_a_patient_loop_waits_and_another_skips_whole_blocks():
+def test_a_waiting_loop_skips_no_block_and_another_skips_whole_blocks():
     recorder = Recorder()
     recorder.go.clear()
     with EstimatorThread(recorder, blocking=False) as beside:

@@ -1,4 +1,4 @@
-"""Devices of a system, built, opened and closed together; with the smallest devices there can be."""
+"""Devices of a system, built, opened and closed together; with minimal devices."""
 
 import threading
 from collections.abc import Callable
@@ -252,7 +252,7 @@ def test_mode_chooses_driver_or_twin() -> None:
 
 @pytest.mark.usefixtures("diary")
 @pytest.mark.parametrize("driver", ["devices.dm.driver=sim-alpao", "devices.screen.driver=sim-screen"])
-def test_a_driver_that_says_it_is_simulated_is_believed(driver: str) -> None:
+def test_a_driver_that_reports_it_is_simulated_is_accepted(driver: str) -> None:
     bench = Bench.from_config(load_system("razor-shwfs", mode="hardware", overrides=[driver]))
     with bench:
         assert bench.simulated
@@ -339,7 +339,7 @@ def test_run_drives_a_procedure_and_stops_it() -> None:
 
 
 @pytest.mark.usefixtures("diary")
-def test_a_bench_says_what_it_is() -> None:
+def test_a_bench_describes_itself() -> None:
     with Bench.from_config(load_system("razor-shwfs", mode="hardware")) as bench:
         assert repr(bench) == "<Bench razor-shwfs, hardware, open>"
     assert repr(Bench.from_config(load_system("razor-shwfs"))) == "<Bench razor-shwfs, simulated, closed>"

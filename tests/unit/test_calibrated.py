@@ -1,4 +1,4 @@
-"""What ``load_matrix`` returns goes wherever a calibration goes; anything else is told the way out."""
+"""What ``load_matrix`` returns is accepted wherever a calibration is; others are refused with a remedy."""
 
 from __future__ import annotations
 

@@ -41,7 +41,7 @@ class Scripted(SyntheticCamera):
         self.log.append("close")
 
 
-def test_counters_tell_delivered_lost_and_timed_out() -> None:
+def test_counters_state_delivered_lost_and_timed_out() -> None:
     timeout = FrameTimeout("wfs", "nothing")
     with Scripted(5, 6, 9, timeout, 10, timeout) as camera:
         for _ in range(3):
@@ -76,7 +76,7 @@ def test_a_driver_that_delivers_no_frame_is_found_out() -> None:
         assert camera.status().delivered == 0
 
 
-def test_a_lost_camera_says_so_and_closes() -> None:
+def test_a_lost_camera_is_reported_and_closes() -> None:
     camera = Scripted(1, DeviceLost("wfs", "cable out"))
     with camera:
         camera.next_frame()

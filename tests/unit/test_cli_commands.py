@@ -1,4 +1,4 @@
-"""Every command hands its options on and its document has every promised field."""
+"""Every command passes on its options, and its document has every documented field."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_config_check_init_schema(escape, document, tmp_path):
     assert "[devices.dm]" in escape("config", "init")[1]
 
 
-def test_calibrate_document_has_every_promised_field(document, bench, tmp_path):
+def test_calibrate_document_has_every_documented_field(document, bench, tmp_path):
     code, found, _ = document("calibrate", "razor-shwfs", "--out", tmp_path / "run", "--seed", 7)
     assert code == 0
     assert (found["schema"], found["system"], found["simulated"], found["seed"]) == (
@@ -75,7 +75,7 @@ def test_calibrate_document_has_every_promised_field(document, bench, tmp_path):
     assert "frames" not in bench.calls[0][1]  # as configured
 
 
-def test_calibrate_hands_its_options_on(escape, bench, tmp_path):
+def test_calibrate_passes_its_options_on(escape, bench, tmp_path):
     code, _, err = escape(
         "calibrate", "razor-shwfs", "--method", "docrime", "--frames", 500, "--poke", 0.01, "--no-whiten",
         "--modes", 50, "--set", "loop.gain=0.3", "--out", tmp_path / "run",
@@ -130,7 +130,7 @@ def test_sprint_uses_the_measured_matrix_and_opens_nothing(document, bench, im, 
     assert synthetic.registration is not None
 
 
-def test_loop_document_has_every_promised_field(document, bench, im, tmp_path):
+def test_loop_document_has_every_documented_field(document, bench, im, tmp_path):
     code, found, _ = document("loop", "razor-shwfs", "--im", im, "--frames", 400, "--out", tmp_path / "run")
     assert code == 0
     assert set(found["strehl"]) == {"peak", "otf", "encircled"}

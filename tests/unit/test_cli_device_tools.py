@@ -1,4 +1,4 @@
-"""``escape dm``, ``camera`` and ``asm`` on twins and on an emulated mirror: what they do and say."""
+"""``escape dm``, ``camera`` and ``asm`` on twins and on an emulated mirror: effects and output."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_what_cannot_be_is_refused_before_it_moves(escape, words, code, message)
     assert message in err
 
 
-def test_a_poke_reaches_the_mirror_and_nothing_is_left(escape, asm):
+def test_a_poke_reaches_the_mirror_and_is_removed(escape, asm):
     made, options = asm
     code, out, err = escape("dm", "poke", *options, 40, 0.03, "--seconds", 0)
     assert code == 0, err
@@ -82,7 +82,7 @@ def test_a_shell_that_floated_floats_on(escape, asm):
 
 
 # --------------------------------------------------------------------- adaptive secondary
-def test_asm_verbs_lead_the_mirror_and_tell(document, asm):
+def test_asm_verbs_change_the_state_and_report_it(document, asm):
     made, options = asm
     code, found, _ = document("asm", "status", *options)
     assert (code, found["state"], found["changed"], found["simulated"]) == (0, "off", False, True)
@@ -116,7 +116,7 @@ def test_a_fault_is_cleared_only_after_a_confirmation(document, escape, asm, mon
     assert (code, found["changed"]) == (0, False)
 
 
-def test_looking_takes_no_control(escape, asm):
+def test_status_takes_no_control(escape, asm):
     made, options = asm
     with other_owner(made):
         out = escape("asm", "status", *options)[1]
@@ -161,7 +161,7 @@ def test_snap_writes_frames_with_their_times(document, tmp_path: Path):
     assert code == 2  # never overwritten
 
 
-def test_show_tells_what_frames_a_file_holds(document, escape, tmp_path: Path):
+def test_show_describes_the_frames_in_a_file(document, escape, tmp_path: Path):
     file = tmp_path / "frames.fits"
     taken = document("camera", "snap", "razor-shwfs", "--frames", 3, "--out", file)[1]
     code, shown, _ = document("show", file)

@@ -1,4 +1,4 @@
-"""``escape emulate``: lists, serves, reports protocol violations, and says where it listens."""
+"""``escape emulate``: lists, serves, reports protocol violations, and prints its address."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def test_violations_are_reported_and_change_the_exit_code(document, monkeypatch)
     [
         (("e272",), "did you mean 'e727'"),
         (("e727", "--option", "serial"), "write KEY=VALUE"),
-        (("e727", "--option", "volume=11"), "has no option 'volume'"),
+        (("e727", "--option", "volume=11"), "--option volume: unknown"),
     ],
 )
 def test_what_is_wrong_is_refused(document, words, says):

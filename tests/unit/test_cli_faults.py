@@ -49,7 +49,7 @@ def test_disk_full_at_the_end_exits_1_after_the_mirror_is_safe(document, bench, 
     assert not list((tmp_path / "run").glob(".*"))
 
 
-def test_the_document_of_an_error_says_what_it_concerns(document, bench, tmp_path):
+def test_the_document_of_an_error_states_what_it_concerns(document, bench, tmp_path):
     def about(found: dict) -> tuple[object, ...]:
         return found["schema"], found["command"], found["system"], found["simulated"], found["seed"]
 

@@ -1,4 +1,4 @@
-"""Ctrl-C in the middle of a command keeps what was measured and leaves the mirror flat."""
+"""Ctrl-C in the middle of a command saves the measured data and leaves the mirror flat."""
 
 from __future__ import annotations
 

@@ -85,7 +85,7 @@ def test_what_it_cannot_do_is_refused_before_it_turns(document, stage):
     assert emulator.controller.state.describe() == "at rest"
 
 
-def test_a_controller_in_use_is_told(document, stage):
+def test_a_controller_in_use_is_reported(document, stage):
     from escape_drivers.pi.transports import TcpTransport
 
     emulator, here = stage
@@ -99,7 +99,7 @@ def test_a_controller_in_use_is_told(document, stage):
     assert "one at a time" in err or "one client at a time" in err
 
 
-def test_a_system_without_one_says_so(document):
+def test_a_system_without_one_is_reported(document):
     code, _, err = document("modulator", "status", "razor-shwfs")
     assert code == 2
     assert "has no modulator" in err

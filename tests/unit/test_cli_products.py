@@ -1,4 +1,4 @@
-"""Commands that read what others wrote."""
+"""Commands that read products."""
 
 from __future__ import annotations
 

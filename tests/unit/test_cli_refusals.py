@@ -1,4 +1,4 @@
-"""What the command line refuses before anything is opened, and how it says so."""
+"""Errors of the command line before anything is opened."""
 
 from __future__ import annotations
 

@@ -13,6 +13,7 @@ from escape_hw.cli.renamed import current_words
         ("sweep x --heats 2 --finals=6", "sweep x --replicates 2 --final-replicates=6"),
         ("sweep x --drop 0:4", "sweep x --dropped-modes 0:4"),
         ("reproduce sky-time --plants 4", "reproduce sky-time --realisations 4"),
+        ("import pyrtc a.yaml x --legacy yx", "import pyrtc a.yaml x --frame-order yx"),
         ("rehearse x -- escape rehearse x --plants", "with-stand-ins x -- escape rehearse x --plants"),
     ],
 )  # fmt: skip
@@ -20,7 +21,7 @@ def test_old_words_are_replaced_and_named(old, new, capsys):
     assert current_words(old.split()) == new.split()
     out, err = capsys.readouterr()
     assert out == ""
-    for word in ("--heats", "--finals", "--drop", "--plants", "rehearse"):
+    for word in ("--heats", "--finals", "--drop", "--plants", "--legacy", "rehearse"):
         renamed = word in {one.partition("=")[0] for one in old.partition(" -- ")[0].split()}
         assert (f"{word} is called" in err) == renamed
 

@@ -116,7 +116,7 @@ def test_too_small_a_share_is_refused_before_anything_runs(document, bench, tmp_
 
 
 @pytest.mark.usefixtures("reports")
-def test_reproduce_all_goes_on_where_it_was(document, bench, tmp_path):
+def test_reproduce_all_continues_where_it_was(document, bench, tmp_path):
     words = ("reproduce", "all", "--out", tmp_path / "all", "--share", 0.1)
     first = document(*words, "--only", "maps")[1]["parts"]["maps"]
     calls = len(bench.calls)
@@ -126,7 +126,7 @@ def test_reproduce_all_goes_on_where_it_was(document, bench, tmp_path):
     assert list(found["parts"]) == ["table1", "maps"]
     assert found["parts"]["maps"]["finished_utc"] == first["finished_utc"]
     assert 'href="maps/report.html"' in (tmp_path / "all" / "index.html").read_text()
-    # What was asked for otherwise is not taken for it.
+    # A run with other settings is not used.
     for other in (("--share", 0.2), ("--seed", 5), ("--set", "loop.gain=0.2")):
         code, refused, _ = document(*words, "--only", "maps", "--resume", *other)
         assert code == 2

@@ -1,4 +1,4 @@
-"""``escape track`` shows its last registration beside what a twin hides."""
+"""``escape track`` shows its last registration with the true one of a twin."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from rich.console import Console
 
 from escape_hw.api.registration import PARAMETERS, Registration
 from escape_hw.api.tracking import TrackResult
-from escape_hw.cli.calibration.display import show_track
+from escape_hw.cli.calibration.display import show_result
 from escape_hw.config.loader import load_system
 from escape_hw.io.documents import track_document
 from escape_hw.runtime.procedures.track import INJECTED_UNKNOWN, injected_registration
@@ -28,7 +28,7 @@ def shown(result: TrackResult, injected: dict[str, float] | None, note: str = ""
     console = Console(file=io.StringIO(), width=120)
     document = {**track_document(result), "injected_end": injected, "injected_note": note, "products": {}}
     one = SimpleNamespace(show=lambda *what: [console.print(item) for item in what])
-    show_track(one, result, injected is not None, document)  # type: ignore[arg-type]
+    show_result(one, "track", result, injected is not None, document)  # type: ignore[arg-type]
     return console.file.getvalue()  # type: ignore[attr-defined, no-any-return]
 
 
@@ -43,7 +43,7 @@ def track() -> TrackResult:
 
 
 @pytest.mark.parametrize("injected", [INJECTED, None])
-def test_the_registration_stands_beside_the_injected_one(injected: dict[str, float] | None) -> None:
+def test_the_registration_is_shown_with_the_injected_one(injected: dict[str, float] | None) -> None:
     text = shown(track(), injected)
     (row,) = [line.split() for line in text.splitlines() if "Shift X" in line]
     assert row[row.index("±") - 1 : row.index("±") + 2] == ["−15.80", "±", "0.10"]
@@ -52,7 +52,7 @@ def test_the_registration_stands_beside_the_injected_one(injected: dict[str, flo
         assert row[-2:] == ["+2.0", "−16"]
 
 
-def test_a_truth_that_cannot_be_known_is_left_out_and_told() -> None:
+def test_true_values_that_are_unknown_are_left_out_with_a_note() -> None:
     config = load_system("razor-shwfs", overrides=("twin.drift.rate.shift_x=2.0",))
     assert injected_registration(config) is not None
     behind = load_system("razor-shwfs", overrides=("twin.drift.rate.shift_x=2.0",), mode="hardware")
@@ -68,7 +68,7 @@ def test_without_a_drift_the_truth_needs_no_clock() -> None:
     assert known.at(1e6).to_dict() == pytest.approx(known.at(0.0).to_dict())
 
 
-def test_the_course_of_a_mirror_seen_askew_is_along_the_axes() -> None:
+def test_the_track_of_a_sheared_mirror_is_along_the_axes() -> None:
     leaning = Registration(1.0, 2.0, 0.5, 2.5, -1.2).with_shear(1.5)
     overrides = [f"twin.registration.{name}={value!r}" for name, value in leaning.to_dict().items()]
     known = injected_registration(

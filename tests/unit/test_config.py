@@ -1,4 +1,4 @@
-"""Reading a system: what comes out, and one golden message for each kind of mistake."""
+"""Reading a system: the result, and one reference message for each kind of error."""
 
 import math
 import tomllib

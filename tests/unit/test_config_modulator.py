@@ -73,7 +73,7 @@ def test_the_wire_is_the_configured_one_and_connects_to_nothing(kind, transport)
     assert type(make_transport(config.devices.modulator, config, {})) is transport
 
 
-def test_options_that_nobody_reads_are_refused():
+def test_options_that_are_not_read_are_refused():
     config = load_system("razor-pywfs", overrides=['devices.modulator.options={zeroed="1"}'])
     assert config.devices.modulator is not None
     with pytest.raises(

@@ -1,4 +1,4 @@
-"""The sensor's section of either kind: what a pyramid asks for, and what is said when it is not there."""
+"""The sensor's section of either kind: keys required for a pyramid, and the errors without them."""
 
 from __future__ import annotations
 

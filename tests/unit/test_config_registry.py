@@ -92,7 +92,7 @@ def test_a_third_party_driver_is_found_by_its_entry_point() -> None:
         ),
     ],
 )
-def test_what_cannot_be_loaded_says_what_to_do(name: str, message: str) -> None:
+def test_what_cannot_be_loaded_states_what_to_do(name: str, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         registry.device_factory(name)
 
@@ -159,7 +159,7 @@ def test_the_same_entry_seen_twice_is_one(monkeypatch: pytest.MonkeyPatch) -> No
     assert registry.available(registry.DEVICES) == ("twin",)
 
 
-def test_nothing_installed_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nothing_installed_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(importlib.metadata, "entry_points", entries())
     with pytest.raises(ConfigError, match="is escape-hw itself installed in this environment"):
         registry.device_factory("sim-alpao")
@@ -184,7 +184,7 @@ def test_a_script_may_register_a_driver_of_its_own(monkeypatch: pytest.MonkeyPat
 def test_a_twin_is_never_offered_instead_of_a_driver() -> None:
     with pytest.raises(ConfigError) as refused:
         registry.device_factory("alpaka", hardware=True)
-    assert "no driver 'alpaka' for real hardware is installed" in str(refused.value)
+    assert "no driver for real hardware 'alpaka' is installed" in str(refused.value)
     assert "sim-" not in str(refused.value)
     assert "--mode sim" in str(refused.value)
 

@@ -93,7 +93,7 @@ def weights(valid, measured):
 
 
 @pytest.mark.parametrize("correlated", [False, True])
-def test_a_matrix_without_errors_of_its_own_is_stated_those_that_its_residual_tells(correlated):
+def test_a_matrix_without_standard_errors_has_those_of_its_residual(correlated):
     valid, system, covariance = fitted(5)
     noise = covariance if correlated else None
     # In units of the matrix instead of its noise.
@@ -104,7 +104,7 @@ def test_a_matrix_without_errors_of_its_own_is_stated_those_that_its_residual_te
     )
 
 
-def test_a_slope_that_never_moved_leaves_the_stated_errors_what_they_are():
+def test_a_constant_slope_does_not_change_the_stated_errors():
     valid, system, noise = fitted(6)
     dead = noise.copy()
     dead[3], dead[:, 3] = 0.0, 0.0

@@ -1,4 +1,4 @@
-"""What a reproduced result must meet, where the runs leave it open."""
+"""Criteria of a reproduced result, where the runs do not determine it."""
 
 from __future__ import annotations
 

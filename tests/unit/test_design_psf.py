@@ -1,4 +1,4 @@
-"""The design's image is that of the telescope, as bright as its pupil."""
+"""The design PSF is that of the telescope, with the flux of its pupil."""
 
 from __future__ import annotations
 

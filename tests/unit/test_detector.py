@@ -1,4 +1,4 @@
-"""The detector's counts have the mean, the noise and the limits that they should."""
+"""The detector's counts have the specified mean, noise and limits."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Rules that detect a diverging loop: what opens it, when, and what does not."""
+"""Rules that detect a diverging loop: conditions that open it and conditions that do not."""
 
 from __future__ import annotations
 

@@ -62,7 +62,7 @@ def test_an_engine_that_had_no_time_to_read_does_not_take_the_front_end_for_sile
 
 
 def test_a_background_thread_that_fails_is_reported() -> None:
-    """A dead request handler or publisher must become a fault, not a silent stop."""
+    """A failed request handler or publisher must become a fault, not a silent stop."""
     failures: list[Exception] = []
     ended = threading.Event()
 

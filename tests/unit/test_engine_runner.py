@@ -225,7 +225,7 @@ def test_a_fail_safe_process_that_cannot_be_started_does_not_end_the_server(
     assert "next attempt in 2 s: Resource temporarily unavailable" in caplog.text
 
 
-def test_a_fail_safe_process_that_dies_at_once_is_started_less_and_less_often(
+def test_a_fail_safe_process_that_ends_at_once_is_started_less_and_less_often(
     process: Any, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     starts: list[float] = []

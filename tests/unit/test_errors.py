@@ -38,7 +38,7 @@ def test_an_abort_carries_its_partial_result_across() -> None:
     assert str(again) == "aborted by the operator"
 
 
-def test_every_error_has_an_exit_code_of_the_agreement() -> None:
+def test_every_error_has_an_exit_code_of_the_specification() -> None:
     def below(kind: type[errors.EscapeError]) -> set[type[errors.EscapeError]]:
         return {kind}.union(*(below(sub) for sub in kind.__subclasses__()))
 

@@ -1,4 +1,4 @@
-"""Random effects under the scatter that the data make likeliest."""
+"""Random effects with the maximum-likelihood variance."""
 
 from __future__ import annotations
 

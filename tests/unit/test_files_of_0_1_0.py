@@ -105,7 +105,7 @@ def test_an_interrupted_calibration_is_resumed(document, tmp_path):
     assert found["converged"]
 
 
-def test_a_tracked_run_keeps_its_course(document):
+def test_a_tracked_run_has_its_time_series(document):
     code, found, _ = document("show", OLD / "track")
     assert code == 0
     assert found["track"]["seconds"] == reported("track")["track"]["seconds"]

@@ -1,4 +1,4 @@
-"""Products survive the disk whole or are refused by name."""
+"""Products are read back complete or refused with the failed check."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def test_what_was_fitted_beside_the_registration_comes_back(tmp_path):
     assert load_matrix(path).registration.extras == extras
 
 
-def test_header_tells_the_origin(saved):
+def test_header_states_the_origin(saved):
     header = fits.getheader(saved)
     wanted = {
         "KIND": "IM", "SCHEMA": 1, "SYSTEM": "razor-shwfs", "METHOD": "escape", "SIMULATE": True,
@@ -157,7 +157,7 @@ def test_matrix_and_grid_must_belong_together(tmp_path, small):
         save_matrix(tmp_path / "im.fits", dataclasses.replace(small, grid=fake.grid(5)))
 
 
-def test_aborted_run_says_so_in_name_and_header(tmp_path):
+def test_an_aborted_run_is_marked_in_name_and_header(tmp_path):
     path = save_matrix(tmp_path / "im.fits", fake.calibration("docrime", partial=True, n=6, n_modes=5))
     assert path.name == "im.partial.fits"
     assert fits.getheader(path)["FINISH"] == "aborted"

@@ -1,4 +1,4 @@
-"""Counters that start over, and camera clocks put on this computer's."""
+"""Counters that wrap, and camera clocks converted to this computer's."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def test_steps_survive_any_number_of_turns(limits, start, steps) -> None:
     assert [b - a for a, b in pairwise(indices)] == steps
 
 
-def test_long_identifiers_go_on() -> None:
+def test_long_identifiers_continue() -> None:
     counter = FrameCounter(*BLOCKS)
     assert [counter.index(n) for n in (65534, 65535, 65536, 70000)] == [65534, 65535, 65536, 70000]
 

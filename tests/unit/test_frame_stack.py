@@ -36,7 +36,7 @@ def test_many_frames_are_averaged_evenly_and_in_order(n):
     np.testing.assert_allclose(kept, want, rtol=1e-6)
 
 
-def test_nothing_taken_nothing_kept():
+def test_without_frames_nothing_is_saved():
     assert len(FrameStack().images()) == 0
     with pytest.raises(ValueError, match="limit is 3"):
         FrameStack(3)

@@ -1,4 +1,4 @@
-"""The search for a matrix's best gain goes on beyond its scan, towards either end."""
+"""The search for a matrix's best gain continues beyond its scan, towards either end."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_a_best_gain_at_the_edge_of_the_scan_is_none(monkeypatch, top, limit):
         assert abs(np.log(found / top)) < np.log(1.5)
 
 
-def test_a_loop_that_closes_at_no_gain_says_so(monkeypatch):
+def test_a_loop_that_closes_at_no_gain_is_reported(monkeypatch):
     def loop(bench, matrix, grid, *, gain, **options):
         return replace(fake_results.loop(), gain=gain, stable=False, partial=False)
         yield
@@ -80,7 +80,7 @@ def test_an_asymmetric_curve_does_not_move_the_best_gain_to_the_edge_of_the_scan
 
 
 @pytest.mark.parametrize("strehl_sigma", [0.003, 0.01])
-def test_the_error_of_the_best_gain_is_honest(strehl_sigma):
+def test_the_error_of_the_best_gain_is_correct(strehl_sigma):
     results = np.array([fitted(strehl_sigma, np.random.default_rng(k)) for k in range(200)])
     pulls = (results[:, 0] - BEST) / results[:, 1]
     assert 0.4 < np.sqrt(np.mean(np.square(pulls))) < 1.5

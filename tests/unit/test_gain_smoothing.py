@@ -1,4 +1,4 @@
-"""Smoothing of optical gains: finds the course, believes the modes as far as their errors allow."""
+"""Smoothing of optical gains: the trend, and single modes weighted by their errors."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ def trials(scatter: float, noise: float, count: int = 12):
 
 
 @pytest.mark.parametrize(("scatter", "noise"), [(0.0, 0.02), (0.0, 0.15), (0.04, 0.02), (0.04, 0.15)])
-def test_errors_are_honest_with_and_without_departures(scatter, noise):
+def test_errors_are_correct_with_and_without_deviations(scatter, noise):
     trend, trend_sigma, best, best_sigma, _ = trials(scatter, noise)
     assert 0.4 < np.mean((trend / trend_sigma) ** 2) < 1.8
     assert 0.2 < np.mean((best / best_sigma) ** 2) < 1.5
 
 
-def test_smoothing_helps_where_noise_rules_and_does_no_harm_where_it_does_not():
+def test_smoothing_improves_noisy_gains_and_does_not_degrade_others():
     *_, best, _, raw = trials(0.0, 0.15)
     assert best.std() < 0.4 * raw.std()
     *_, best, _, raw = trials(0.1, 0.01)

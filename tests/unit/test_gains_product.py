@@ -41,7 +41,7 @@ def test_a_product_gives_back_everything(tmp_path):
         assert getattr(found, name) == getattr(made, name), name
 
 
-def test_an_aborted_bootstrap_without_a_round_is_kept_under_a_name_that_says_so(tmp_path):
+def test_an_aborted_bootstrap_without_a_round_is_saved_under_a_marked_name(tmp_path):
     made = replace(fake.gains_result(), rounds=(), comparisons={}, converged=False, partial=True)
     path = save_gains(tmp_path / "gains.fits", made, "razor-pywfs", True)
     assert path.name == "gains.partial.fits"
@@ -62,7 +62,7 @@ def test_another_kind_and_damage_are_refused(tmp_path):
         load_gains(path)
 
 
-def test_the_document_has_the_promised_fields():
+def test_the_document_has_the_documented_fields():
     document = gains_document(fake.gains_result())
     assert len(document["optical_gain"]) == len(document["sigma"]) == N
     assert document["converged"] is True

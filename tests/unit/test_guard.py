@@ -1,4 +1,4 @@
-"""The guard: whatever goes in, what comes out obeys every limit, and legal commands pass untouched."""
+"""The guard: every output satisfies all limits, and valid commands pass unchanged."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_what_was_let_through_is_let_through_again_untouched(
 
 @settings(max_examples=200, deadline=None)
 @given(limits=any_limits, start=commands, direction=commands, share=st.floats(0.0, 0.99))
-def test_legal_commands_pass_bit_for_bit(
+def test_valid_commands_pass_bit_for_bit(
     limits: MirrorLimits, start: NDArray[np.float64], direction: NDArray[np.float64], share: float
 ) -> None:
     guard = guard_with(limits)

@@ -1,4 +1,4 @@
-"""What the guard does to a command that goes too far, and what it says about it."""
+"""The guard's action on commands beyond the limits, and its report."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from escape_hw.errors import CommandRejected
 from escape_hw.safety.limits import MirrorLimits
 
 
-def test_the_answer_cannot_be_changed_by_anyone() -> None:
+def test_the_result_is_read_only() -> None:
     guard = guard_with(MirrorLimits())
     command = np.full(N, 0.1)
     safe, _ = guard(command)
@@ -36,7 +36,7 @@ def test_limit_remembers_nothing_before_it_is_accepted() -> None:
     np.testing.assert_allclose(third, 0.2)
 
 
-def test_report_says_what_was_done() -> None:
+def test_report_states_what_was_done() -> None:
     command = np.zeros(N)
     command[[4, 5]] = 2.0, -2.0
     _, report = guard_with(MirrorLimits(max_stroke=0.5))(command)

@@ -1,4 +1,4 @@
-"""What the guard takes for a command, and what it rejects whole."""
+"""Inputs that the guard accepts as a command, and those that it rejects."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the panels show, without a window: mosaics, courses, curves, forms."""
+"""Contents of the panels, without a window: mosaics, time series, curves, forms."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ def test_one_mode_in_every_matrix():
 
 
 # ---------------------------------------------------------------- SPRINT
-def test_a_course_is_shown_in_the_papers_units():
+def test_a_track_is_shown_in_the_papers_units():
     values = np.array([[1.0, -2.0, 0.5, 3.0, 0.0], [2.0, -71.0, -0.77, 2.9, 0.0]])
     course = ConvergenceHistory.of(
         values * TO_STREAM_UNITS, np.full(5, 0.1) * TO_STREAM_UNITS, np.array([0.0, 0.3]), True
@@ -141,7 +141,7 @@ def test_drift_counts_from_the_first_known_value():
 
 
 # ---------------------------------------------------------------- optical gains
-def test_gains_stand_on_two_axes_where_they_need_them():
+def test_gains_are_on_two_axes_where_needed():
     low, high = (GainCurve.of(str(level), fake.optical_gains(level)) for level in (0.6, 1.9))
     assert axis_sides({"low": low, "high": high}) == {"low": "left", "high": "right"}
     assert axis_sides({"high": high}) == {"high": "left"}
@@ -186,7 +186,7 @@ def test_lengths_of_time(seconds, text):
     assert form.format_duration(seconds) == text
 
 
-def test_progress_in_words():
+def test_progress_as_text():
     run = ActiveRun(
         id=1, name="docrime", arguments={}, stage="DO-CRIME", completed=610, total=1000, remaining_s=252
     )

@@ -49,7 +49,7 @@ def test_nothing_counted_is_nan():
     assert math.isnan(LoopTiming().since_start().p99)
 
 
-def test_a_loop_knows_its_last_second_and_all_of_its_time():
+def test_a_loop_reports_its_last_second_and_its_total():
     timing, rng, now = LoopTiming(), np.random.default_rng(2), 10**12
     spacings, latencies = [], []
     for number in range(6000):

@@ -1,4 +1,4 @@
-"""What makes the loop's way short, each held against the plain way."""
+"""Optimised functions of the loop, each compared with a plain implementation."""
 
 from __future__ import annotations
 
@@ -122,7 +122,7 @@ def test_only_zonal_modes_are_taken_for_such():
     seed=st.integers(0, 1000),
     smooth=st.booleans(),
 )
-def test_the_compiled_check_agrees_with_the_rules_in_words(
+def test_the_compiled_check_agrees_with_the_written_rules(
     size, slew, mean, neighbour, disabled, seed, smooth
 ):
     rng = np.random.default_rng(seed)
@@ -241,7 +241,7 @@ def test_a_spinning_reader_sees_a_change_made_elsewhere():
 
 
 # ---------------------------------------------------------------- the operating system
-def test_all_is_as_before_in_the_end():
+def test_the_initial_state_is_restored():
     before = os.sched_getscheduler(0), os.sched_getaffinity(0)
     with realtime_thread(cpus=[min(before[1])]) as notes:
         assert os.sched_getaffinity(0) == {min(before[1])} or notes

@@ -1,4 +1,4 @@
-"""The leaky integrator, and the gain that a delayed loop can bear."""
+"""The leaky integrator, and the stability limit of the gain with delay."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ def test_results_are_updated_in_place():
     assert control.residual[0] == 1
 
 
-def test_it_goes_on_from_what_the_mirror_really_did():
+def test_it_continues_from_what_the_mirror_really_did():
     r = np.random.default_rng(1).standard_normal((7, 20)).astype(np.float32)
     control, slopes = LeakyIntegrator(r, 0.4, 0.1), np.ones(20, np.float32)
     control(slopes)
@@ -135,7 +135,7 @@ def test_modes_have_gains_of_their_own():
         control.set_gain(np.array([0.1, 0.0, 0.2]))
 
 
-def test_another_reconstructor_comes_without_a_bump():
+def test_another_reconstructor_comes_without_a_transient():
     rng = np.random.default_rng(3)
     old, new = rng.standard_normal((2, 5, 12)).astype(np.float32)
     control, slopes = LeakyIntegrator(old, 0.4, 0.1), rng.standard_normal(12).astype(np.float32)

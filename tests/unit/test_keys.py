@@ -34,7 +34,7 @@ def test_keys_are_made_once_and_are_the_users_own(document) -> None:
     assert document("keys", "make", "--replace")[1]["public"] != made["public"]
 
 
-def test_a_key_is_told_as_a_shell_takes_it(escape, document) -> None:
+def test_a_key_is_printed_as_a_shell_accepts_it(escape, document) -> None:
     public = document("keys", "make")[1]["public"]
     lines = [line for line in escape("keys", "make")[1].splitlines() if "escape keys" in line]
     assert [shlex.split(line.partition("escape ")[2])[-1] for line in lines] == [public] * 2

@@ -1,4 +1,4 @@
-"""Actuators stand where their layout says, and the guard knows which are neighbours."""
+"""Positions of actuators by layout, and their neighbours."""
 
 from __future__ import annotations
 

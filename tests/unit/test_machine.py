@@ -1,4 +1,4 @@
-"""``escape udev``, ``doctor`` and ``discover`` on computers that are made up."""
+"""``escape udev``, ``doctor`` and ``discover`` on simulated computers."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def test_rules_stand_before_those_that_grant_access() -> None:
     assert 'ATTR{latency_timer}="1"' in RULES
 
 
-def test_install_shows_first_and_changes_only_when_told(document, escape, tmp_path: Path) -> None:
+def test_install_shows_first_and_changes_only_after_confirmation(document, escape, tmp_path: Path) -> None:
     root = tmp_path / "root"
     root.mkdir()
     code, found, err = document("udev", "install", "--root", root)
@@ -117,7 +117,7 @@ def test_install_without_permission_names_the_command(escape) -> None:
 
 
 # --------------------------------------------------------------------- doctor
-def test_doctor_names_what_is_wrong_and_the_way_out(bench: Path) -> None:
+def test_doctor_names_what_is_wrong_and_the_remedy(bench: Path) -> None:
     found = levels(bench)
     for item, text, way in (
         ("usbfs memory", "16 MB", "usbcore.usbfs_memory_mb=1000"),
@@ -132,7 +132,7 @@ def test_doctor_names_what_is_wrong_and_the_way_out(bench: Path) -> None:
     assert doctor.exit_code(list(found.values())) == 1
 
 
-def test_doctor_tells_the_way_out_of_a_computer_without_usb(tmp_path: Path) -> None:
+def test_doctor_gives_the_remedy_on_a_computer_without_usb(tmp_path: Path) -> None:
     config = load_system("razor-shwfs", overrides=["devices.wfs.mode=hardware"])
     found = levels(tmp_path, config)
     assert found["usbfs memory"].level == "error"
@@ -227,7 +227,7 @@ def test_what_is_pasted_is_a_sound_configuration(bench: Path, monkeypatch, tmp_p
         assert getattr(config.devices, key).mode == "hardware"
 
 
-def test_a_device_in_use_says_by_whom(bench: Path) -> None:
+def test_a_device_in_use_names_the_owner(bench: Path) -> None:
     device = bench / "dev/bus/usb/001/004"
     put(bench, "dev/bus/usb/001/004", "")
     put(bench, "proc/4711/comm", "xiCamTool")
@@ -246,7 +246,7 @@ def test_a_library_that_is_there_is_named_by_its_file(bench: Path, monkeypatch) 
     assert re.search(r"/libc\S*\.so", found.text)
 
 
-def test_a_mirror_on_the_network_is_found_where_it_is_looked_for(document) -> None:
+def test_a_mirror_on_the_network_is_found_at_a_given_host(document) -> None:
     with make_emulator(EmulatorRequest(port=0)) as made:
         where = made.start().removeprefix("tcp ")
         code, found, _ = document("discover", "--host", where, "--host", "127.0.0.1:1")

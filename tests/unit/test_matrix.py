@@ -1,4 +1,4 @@
-"""Interaction matrices: consistent by construction, honest about noise."""
+"""Interaction matrices: consistent by construction, with noise."""
 
 from __future__ import annotations
 

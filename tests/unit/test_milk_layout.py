@@ -1,4 +1,4 @@
-"""Where milk's images keep what: numbers that its library printed, and images laid out by them."""
+"""Layout of milk's images: offsets printed by its library, and images with this layout."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ def test_a_file_of_another_size_is_refused(folder: Path) -> None:
         MilkStream.open("frame")
 
 
-def test_an_image_of_ours_is_everybodys_and_whole_at_once(folder: Path) -> None:
+def test_an_image_of_ours_is_writable_by_all_and_complete_at_once(folder: Path) -> None:
     before = MilkStream.create("one", (5, 7), "u2")
     after = MilkStream.create("one", (4, 3, 2), "f4")
     try:

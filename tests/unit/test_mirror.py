@@ -341,7 +341,7 @@ def test_guard_report_reaches_the_counters() -> None:
 
 @settings(max_examples=40, deadline=None)
 @given(st.lists(st.floats(-1.2, 1.2), min_size=N, max_size=N), st.floats(0.05, 1.0))
-def test_what_obeys_is_sent_as_it_is_and_nothing_else_is(values: list[float], slew: float) -> None:
+def test_valid_commands_are_sent_unchanged_and_others_are_not(values: list[float], slew: float) -> None:
     with RecordingMirror("dm", MirrorLimits(max_stroke=0.9, max_slew=slew, max_mean=0.3)) as dm:
         shape = np.array(values)
         is_legal = dm.is_legal(shape)

@@ -1,4 +1,4 @@
-"""The mirror moves as its differential equation says."""
+"""The mirror follows its differential equation."""
 
 from __future__ import annotations
 

@@ -66,7 +66,7 @@ def test_the_callers_arrays_stay_as_they_were(case):
     assert all(np.array_equal(case[name], before[name]) for name in case)
 
 
-def test_efficient_derivatives_are_what_random_effects_cannot_imitate(case):
+def test_projected_derivatives_are_orthogonal_to_the_random_effects(case):
     system = normal_equations(**case)
     j, k = jacobian(case), N_COMMON
     common, random = j[:, :k], j[:, k:]
@@ -97,7 +97,7 @@ def test_without_priors_they_are_orthogonal_to_every_random_effect(case):
     )
 
 
-def test_information_on_the_common_parameters_is_that_of_the_efficient_derivatives(case):
+def test_information_on_the_common_parameters_is_that_of_the_projected_derivatives(case):
     # Schur complement of the system == efficient scores' squares plus what the priors add.
     system, k = normal_equations(**case), N_COMMON
     a, b, c = system.matrix[:k, :k], system.matrix[:k, k:], system.matrix[k:, k:]

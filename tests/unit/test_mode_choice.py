@@ -1,4 +1,4 @@
-"""Choosing modes by information, and naming what they cannot tell apart."""
+"""Choosing modes by information, and reporting degenerate parameters."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def test_three_that_go_together_are_named_together():
     assert note.startswith("gain, radial scaling and tangential scaling are hardly separable")
 
 
-def test_only_sub_apertures_that_stand_out_are_trusted_less():
+def test_only_outlying_sub_apertures_have_less_weight():
     residual = np.random.default_rng(0).standard_normal((60, 40))
     assert huber_weights(residual).min() > 0.9
     residual[[3, 33]] *= 10

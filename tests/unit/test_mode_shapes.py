@@ -1,4 +1,4 @@
-"""Zernike and Fourier modes as a mirror makes them."""
+"""Zernike and Fourier modes as fitted by a mirror."""
 
 from __future__ import annotations
 

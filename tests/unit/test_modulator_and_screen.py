@@ -1,4 +1,4 @@
-"""Modulators and phase screens: what their checked methods let through."""
+"""Modulators and phase screens: their checked methods."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the slopes of a run say of the air: how much it moves, for how long, and beside which pokes."""
+"""Strength and correlation time of the turbulence from the slopes of a run, in the presence of pokes."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ def pupils() -> PyramidPupils:
 
 
 def run(frames: int, memory: float, white: float, seed: int) -> PyramidPupils:
-    """Slopes that forget over ``memory`` frames beside a white share of their variance."""
+    """Slopes with a correlation time of ``memory`` frames and a white fraction of their variance."""
     rng = np.random.default_rng(seed)
     slope_statistics, keep = SlopeStatistics(128), np.exp(-1 / memory)
-    air = rng.standard_normal(128)
+    correlated = rng.standard_normal(128)
     for _ in range(frames):
-        air = keep * air + np.sqrt(1 - keep**2) * rng.standard_normal(128)
-        slopes = np.sqrt(1 - white) * air + np.sqrt(white) * rng.standard_normal(128)
+        correlated = keep * correlated + np.sqrt(1 - keep**2) * rng.standard_normal(128)
+        slopes = np.sqrt(1 - white) * correlated + np.sqrt(white) * rng.standard_normal(128)
         slope_statistics.add((0.3 * slopes + 0.1).astype(np.float32), 0.05 * rng.standard_normal(4))
     found = slope_statistics.annotate_geometry(pupils())
     assert isinstance(found, PyramidPupils)
@@ -40,19 +40,19 @@ def test_motion_pokes_and_what_lasts(memory: float, white: float) -> None:
     assert np.mean([f.persistent_fraction for f in found]) == pytest.approx(
         (1 - white) * np.exp(-2 / memory), abs=0.04
     )
-    # The integral of an exponential's correlation is twice its memory; the air's share is told two frames
+    # The integral of an exponential's correlation is twice its memory; its fraction is estimated two frames
     # late and a little small, so its correlation seems so much longer. Noise that is new in every frame
-    # does not count as states of the air.
+    # does not count as states of the turbulence.
     integral = 1 + np.exp(2 / memory) * (2 / (np.exp(1 / memory) - 1))
     assert np.mean([f.n_effective for f in found]) == pytest.approx(1500 / integral, rel=0.3)
 
 
-def test_too_few_frames_tell_no_looks() -> None:
+def test_too_few_frames_give_no_number_of_samples() -> None:
     assert run(3, 5.0, 0.0, 1).n_effective == 0
     assert run(2, 5.0, 0.0, 1).persistent_fraction == 0
 
 
-def test_a_run_that_goes_on_later_tells_the_same() -> None:
+def test_a_resumed_run_gives_the_same() -> None:
     rng = np.random.default_rng(7)
     slopes, pokes = rng.standard_normal((300, 16)).cumsum(axis=0), rng.standard_normal((300, 4))
     whole, first, second = SlopeStatistics(16), SlopeStatistics(16), SlopeStatistics(16)
@@ -70,7 +70,7 @@ def test_a_run_that_goes_on_later_tells_the_same() -> None:
     assert other.persistent_fraction == pytest.approx(one.persistent_fraction, abs=0.02)
 
 
-def test_a_closed_loop_tells_nothing_of_the_air_within_a_lenslet() -> None:
+def test_a_closed_loop_gives_no_turbulence_within_a_lenslet() -> None:
     rng, lenslets = np.random.default_rng(3), fake.grid(8)
     slope_statistics, slopes = SlopeStatistics(lenslets.n_slopes), np.zeros(lenslets.n_slopes)
     for _ in range(200):

@@ -61,7 +61,7 @@ def test_noise_biases_the_ratio_as_predicted_and_the_projection_not():
     assert 0.8 < np.mean(pulls**2) < 1.25
 
 
-def test_errors_of_the_ratio_are_honest():
+def test_errors_of_the_ratio_are_correct():
     rng, reference = np.random.default_rng(1), clean()
     found = [deviation_ratio(noisy(reference, 0.1, rng), reference) for _ in range(60)]
     values, sigmas = (np.array([pair[k] for pair in found]) for k in (0, 1))

@@ -1,4 +1,4 @@
-"""Paired comparisons: the interval holds the truth as often as it says, and the words follow from it."""
+"""Paired comparisons: coverage of the interval, and the conclusion derived from it."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from escape_hw.pipeline.statistics import PairedComparison, compare_pairs, descr
 REPEATS = 200
 
 
-def planted(seed: int, n: int, difference: float, skewed: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Two arms on common air that scatters far more than their difference does."""
+def injected(seed: int, n: int, difference: float, skewed: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Two arms on common turbulence that scatters far more than their difference does."""
     rng = np.random.default_rng(seed)
-    air = rng.normal(0.35, 0.05, n)
+    turbulence = rng.normal(0.35, 0.05, n)
     scatter = rng.exponential(0.008, n) - 0.008 if skewed else rng.normal(0, 0.008, n)
-    return air + difference + scatter, air
+    return turbulence + difference + scatter, turbulence
 
 
 @pytest.mark.parametrize("skewed", [False, True])
@@ -23,7 +23,7 @@ def planted(seed: int, n: int, difference: float, skewed: bool) -> tuple[np.ndar
 def test_the_interval_holds_the_truth_as_often_as_it_says(n, skewed):
     inside = margin = 0
     for seed in range(REPEATS):
-        found = compare_pairs(*planted(seed, n, 0.006, skewed), seed=seed)
+        found = compare_pairs(*injected(seed, n, 0.006, skewed), seed=seed)
         inside += found.low <= 0.006 <= found.high
         margin += found.equivalence < 0.006
     # 200 draws of a probability of 0.95 scatter by 1.5 %; three of that, and what skewness costs.
@@ -32,8 +32,8 @@ def test_the_interval_holds_the_truth_as_often_as_it_says(n, skewed):
     assert margin / REPEATS <= 0.05 + 3 * 0.0154 + 0.02
 
 
-def test_pairs_see_what_lies_below_the_scatter_of_the_air():
-    first, second = planted(3, 24, 0.02, False)
+def test_pairs_resolve_differences_below_the_scatter_due_to_turbulence():
+    first, second = injected(3, 24, 0.02, False)
     assert compare_pairs(first, second).low > 0
     # Without pairs the same difference drowns.
     rolled = compare_pairs(first, np.roll(second, 1))
@@ -41,7 +41,7 @@ def test_pairs_see_what_lies_below_the_scatter_of_the_air():
 
 
 def test_order_changes_the_sign_and_nothing_else():
-    first, second = planted(1, 20, 0.01, True)
+    first, second = injected(1, 20, 0.01, True)
     one, other = compare_pairs(first, second), compare_pairs(second, first)
     assert other.mean == pytest.approx(-one.mean)
     assert (-other.high, -other.low) == pytest.approx((one.low, one.high), abs=2e-4)

@@ -1,4 +1,4 @@
-"""The paper's numbers beside ours: a row for each, ours where the run is there."""
+"""The paper's numbers and those of the twins: one row each, with the twin's where the run exists."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def sweep_run(tmp_path_factory):
     return folder.path
 
 
-def test_without_runs_every_row_says_how_to_make_it(tmp_path):
+def test_without_runs_every_row_states_how_to_make_it(tmp_path):
     text = write_results(tmp_path / "results", {}).read_text()
     rows = [line for line in text.splitlines() if line.startswith("| ")][1:]
     assert len(rows) > 25
@@ -46,7 +46,7 @@ def test_a_sweep_fills_its_rows_and_draws_its_figures(tmp_path, sweep_run):
     assert all(path.stat().st_size < 120_000 for path in tmp_path.glob("*.png"))
 
 
-def test_the_report_tells_of_a_sweep(sweep_run):
+def test_the_report_describes_a_sweep(sweep_run):
     page = write_report(sweep_run).read_text()
     for words in ("Sweep", "equivalent within", "Importance by functional analysis", "dropped modes"):
         assert words in page
@@ -58,7 +58,7 @@ def test_what_is_no_sweep_of_the_papers_is_refused(tmp_path):
         find_sweeps([tmp_path])
 
 
-def test_a_sweep_that_was_broken_off_is_not_taken_for_a_finished_one(sweep_run, tmp_path):
+def test_a_sweep_that_was_interrupted_is_not_taken_for_a_finished_one(sweep_run, tmp_path):
     document = json.loads((sweep_run / "result.json").read_text())
     (tmp_path / "result.json").write_text(json.dumps({**document, "partial": True}))
     with pytest.raises(ConfigError, match="unfinished; finish it"):

@@ -1,4 +1,4 @@
-"""Derivatives of a mirror whose influence functions stand on a large pedestal, against differences."""
+"""Derivatives of a mirror whose influence functions have a large pedestal, against differences."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def test_unequal_widths_spread_the_pedestal_too(
     assert np.linalg.norm(made - want) < 0.01 * np.linalg.norm(want)
 
 
-def test_a_found_mirror_moves_with_its_pedestal(model: ShackHartmannModel) -> None:
+def test_a_fitted_mirror_moves_with_its_pedestal(model: ShackHartmannModel) -> None:
     nothing, single = np.zeros(model.n_act), np.eye(model.n_act)
     open_gains = ActuatorCorrections(nothing, nothing + 0.01, nothing, 0.5)
     estimate = told(open_gains)

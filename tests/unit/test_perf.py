@@ -41,7 +41,7 @@ def stages(monkeypatch):
     monkeypatch.setattr(perf, "entry_points", lambda group: points)
 
 
-def test_the_ratio_says_how_many_times_better():
+def test_the_ratio_states_how_many_times_better():
     assert row().ratio == 3.0
     assert row(better="higher").ratio == pytest.approx(1 / 3)
     assert row(peer_figure=None).ratio is None

@@ -1,4 +1,4 @@
-"""What is told of a procedure before it starts."""
+"""The plan of a procedure before it starts."""
 
 from __future__ import annotations
 

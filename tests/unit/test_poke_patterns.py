@@ -1,4 +1,4 @@
-"""Sequences of pokes: their sizes, their order, and what they know of each other."""
+"""Sequences of pokes: amplitudes, order and correlation."""
 
 from __future__ import annotations
 

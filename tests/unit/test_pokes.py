@@ -21,7 +21,7 @@ def drawn(kind: str, n: int = 20_000) -> np.ndarray:
 
 
 @pytest.mark.parametrize("kind", ["white", "anticorrelated"])
-def test_they_have_the_rms_asked_for_and_the_modes_are_independent(kind):
+def test_they_have_the_requested_rms_and_the_modes_are_independent(kind):
     pokes = drawn(kind)
     np.testing.assert_allclose(pokes.std(axis=0), AMPLITUDE / np.sqrt(3), rtol=0.03)
     correlation = np.corrcoef(pokes.T) - np.eye(3)
@@ -35,7 +35,7 @@ def test_white_pokes_are_what_they_were():
     assert select_random_pokes("equal-snr") is RandomPokes
 
 
-def test_shaped_pokes_alternate():
+def test_anticorrelated_pokes_alternate():
     pokes = drawn("anticorrelated") / AMPLITUDE
     by_lag = [np.mean(pokes[k:] * pokes[: len(pokes) - k]) / np.mean(pokes**2) for k in (1, 2)]
     assert by_lag == pytest.approx([-ANTICORRELATION, ANTICORRELATION**2], abs=0.03)

@@ -1,4 +1,4 @@
-"""The runner: abort from a thread, Ctrl-C wherever it lands, observers that crash, stubborn procedures."""
+"""The runner: abort from a thread, Ctrl-C at any point, failing observers, procedures that ignore it."""
 
 from __future__ import annotations
 
@@ -258,7 +258,7 @@ def test_it_runs_in_another_thread_too() -> None:
     assert answer == [3]
 
 
-def test_a_crashing_observer_is_dropped_and_the_others_go_on(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_crashing_observer_is_dropped_and_the_others_continue(caplog: pytest.LogCaptureFixture) -> None:
     calls: list[int] = []
     seen: list[Progress] = []
 
@@ -296,7 +296,7 @@ def test_errors_of_the_procedure_come_out_unchanged() -> None:
     assert caught.value is lost
 
 
-def test_a_device_fault_during_clean_up_after_an_abort_is_the_news() -> None:
+def test_a_device_fault_during_clean_up_after_an_abort_is_raised() -> None:
     abort = threading.Event()
 
     def failing() -> Procedure[None]:
@@ -336,7 +336,7 @@ def test_reporter_is_due_at_once_and_then_at_most_twenty_times_a_second(
     report = Reporter("frames", 1000)
     yielded = []
     for frame in range(1000):
-        if report.due():
+        if report.is_due():
             yielded.append(report(frame, flux=2.0))
         now += 0.002
     assert len(yielded) == pytest.approx(2.0 / Reporter.PERIOD_S, abs=1)

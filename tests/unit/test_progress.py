@@ -33,7 +33,7 @@ def test_lines_elsewhere_are_few():
     assert lines == ["push-pull: 1 of 100 frames", "DO-CRIME: 1 of 100 frames"]
 
 
-def test_lines_tell_the_time_left_once_it_can_be_known():
+def test_lines_show_the_remaining_time_once_it_is_known():
     stream = io.StringIO()
     with ProgressView(Console(file=stream, width=120)) as view:
         view(Progress("DO-CRIME", 2, 200, elapsed_s=0.9))
@@ -56,7 +56,7 @@ def test_quiet_shows_nothing():
         (-1, ""),
     ],
 )
-def test_time_left_in_words(seconds, words):
+def test_time_left_as_text(seconds, words):
     assert format_time_left(seconds) == words
 
 

@@ -1,4 +1,4 @@
-"""What scripts get from ``import escape_hw``: the names, and an open system's methods on the twin."""
+"""Public names of ``escape_hw``, and an open system's methods on the twin."""
 
 from __future__ import annotations
 
@@ -104,18 +104,18 @@ def found(bench: escape_hw.System) -> escape_hw.CalibrationResult:
     return bench.calibrate("escape", frames=FRAMES)
 
 
-def test_escape_recovers_the_planted_registration(
+def test_escape_recovers_the_injected_registration(
     bench: escape_hw.System, found: escape_hw.CalibrationResult
 ) -> None:
     assert found.matrix.method == "escape"
     assert found.registration is not None
     assert found.registration.converged
-    planted = bench.config.twin.registration.to_registration().to_array()
-    error = np.abs(found.registration.registration.to_array() - planted)
+    injected = bench.config.twin.registration.to_registration().to_array()
+    error = np.abs(found.registration.registration.to_array() - injected)
     assert (error < [5.0, 5.0, 0.2, 1.0, 1.0]).all()
     assert found.measured is not None
     again = bench.find_registration(found.measured, found.grid).registration.to_array()
-    assert (np.abs(again - planted) < [5.0, 5.0, 0.2, 1.0, 1.0]).all()
+    assert (np.abs(again - injected) < [5.0, 5.0, 0.2, 1.0, 1.0]).all()
 
 
 @pytest.mark.parametrize("whiten", [True, False])
@@ -147,8 +147,8 @@ def test_push_pull_takes_the_turbulence_out_and_puts_it_back(bench: escape_hw.Sy
     assert result.matrix.method == "push-pull"
     estimate = bench.find_registration(result.matrix, result.grid)
     assert estimate.converged
-    planted = bench.config.twin.registration.to_registration()
-    error = estimate.registration.to_array() - planted.to_array()
+    injected = bench.config.twin.registration.to_registration()
+    error = estimate.registration.to_array() - injected.to_array()
     assert np.abs(error[:2]).max() < 10.0
     # Vibration moves all slopes of a column together; error bars that forget it are 20 times too small.
     assert np.abs(error / estimate.sigma).max() < 5.0

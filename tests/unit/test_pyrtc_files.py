@@ -119,7 +119,7 @@ def test_a_grid_beyond_the_frame_is_refused() -> None:
         PyrtcLenslets.from_grid(grid, (200, 200))
 
 
-def test_a_mask_whose_place_is_undecided_is_told() -> None:
+def test_a_mask_whose_place_is_undecided_is_reported() -> None:
     windows = PyrtcLenslets(8.0, 0, 0, (80, 80))
     mask = np.zeros((20, 10), bool)
     mask[1:6, 2:7] = mask[11:16, 2:7] = True
@@ -195,10 +195,10 @@ def _old_files(folder: Path, result: CalibrationResult) -> PyrtcConfig:
     return PyrtcConfig.read(whole)
 
 
-def test_files_of_1x_are_read_when_somebody_says_how_they_were_made(tmp_path: Path) -> None:
+def test_files_of_1x_are_read_with_a_given_orientation(tmp_path: Path) -> None:
     result = lenslets()
     config = _old_files(tmp_path, result)
-    with pytest.raises(IncompatibleProduct, match="--legacy yx"):
+    with pytest.raises(IncompatibleProduct, match="--frame-order yx"):
         import_matrix(config, target(result))
     with pytest.raises(ConfigError, match="it is one of yx, xy, as_is"):
         import_matrix(config, target(result), frame_order="zz")
@@ -278,7 +278,7 @@ def test_what_does_not_fit_the_system_is_refused(tmp_path: Path) -> None:
         PyrtcConfig.read(whole)
 
 
-def test_a_missing_package_names_the_way_out() -> None:
+def test_a_missing_package_names_the_remedy() -> None:
     with pytest.raises(ConfigError, match=r"'no_such_package'.*pip install 'escape-hw\[interchange\]'"):
         optional_packages.import_optional("no_such_package", "Reading nothing")
 
@@ -309,7 +309,7 @@ def test_export_and_import_from_the_command_line(tmp_path: Path, document, monke
     assert product.header["BASIS"] == "file"
 
 
-def test_the_command_line_refuses_in_words(tmp_path: Path, document, im) -> None:
+def test_the_command_line_refuses_with_a_message(tmp_path: Path, document, im) -> None:
     code, told, _ = document("export", "pyrtc", im, "--out", tmp_path / "rtc")
     assert code == 2
     assert "calibrate again with this version" in told["error"]["message"]

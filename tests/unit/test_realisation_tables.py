@@ -1,4 +1,4 @@
-"""Campaigns over plants go on where they stopped, and keep apart what was asked for otherwise."""
+"""Campaigns over realisations are resumed, and other settings are kept separate."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def test_realisations_that_the_file_has_are_not_measured_again(tables, tmp_path)
     assert [json.loads(line)["realisation"] for line in target.read_text().splitlines()] == [0, 1, 3]
 
 
-def test_realisations_that_were_asked_for_otherwise_are_not_told_with_these(tables, tmp_path):
+def test_realisations_of_other_settings_are_not_mixed_with_these(tables, tmp_path):
     target = tmp_path / "lines.jsonl"
     tables.each_realisation(target, {"frames": 20}, [0], lambda number: {})
     before = target.read_bytes()

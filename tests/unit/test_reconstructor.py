@@ -1,4 +1,4 @@
-"""Reconstructors invert what they keep and drop what costs most."""
+"""Reconstructors invert the retained modes and drop those with the most stroke."""
 
 from __future__ import annotations
 

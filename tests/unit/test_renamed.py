@@ -167,7 +167,7 @@ def test_a_checkpoint_of_0_1_0_is_of_the_same_run(tmp_path: Path) -> None:
         )
 
 
-def test_the_command_line_says_it_in_one_line(tmp_path: Path) -> None:
+def test_the_command_line_reports_it_in_one_line(tmp_path: Path) -> None:
     file = tmp_path / "old.toml"
     file.write_text(bundled_text("razor-shwfs") + "\n[tracking]\nworth = 0.5\n")
     outcome = CliRunner().invoke(app, ["config", "check", str(file), "--json"])

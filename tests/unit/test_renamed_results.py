@@ -7,6 +7,8 @@ from dataclasses import replace
 import fake_results as fake
 import pytest
 
+from escape_hw.api.procedure import Reporter
+
 
 def test_a_registration():
     estimate = fake.registration()
@@ -35,3 +37,9 @@ def test_the_delay():
     response = fake.calibration().response
     with pytest.warns(DeprecationWarning, match=r"TemporalResponse.delay is called"):
         assert response.delay == response.delay_frames
+
+
+def test_a_reporter():
+    report = Reporter("stage", 3)
+    with pytest.warns(DeprecationWarning, match=r"Reporter.due is called Reporter.is_due"):
+        assert report.due()

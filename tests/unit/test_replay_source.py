@@ -1,4 +1,4 @@
-"""A run folder or a product as a source for panels."""
+"""A run folder or a product as a data source for panels."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ def test_the_library_reads_each_matrix_once(folder, library):
     assert library.loaded is loaded
 
 
-def test_the_library_tells_what_it_cannot_read(folder, library, tmp_path, caplog):
+def test_the_library_reports_what_it_cannot_read(folder, library, tmp_path, caplog):
     damaged = tmp_path / "bad.fits"
     shutil.copy(folder / "escape.fits", damaged)
     damaged.write_bytes(damaged.read_bytes()[:-2880])

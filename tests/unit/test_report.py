@@ -1,4 +1,4 @@
-"""Figures say what they should, and the report is one sound page that needs nothing else."""
+"""Contents of figures, and the report as one valid, self-contained page."""
 
 from __future__ import annotations
 
@@ -134,7 +134,7 @@ def test_same_run_gives_the_same_page(tmp_path):
     assert write_report(folder).read_bytes() == first
 
 
-def test_hardware_and_aborted_runs_say_so(tmp_path):
+def test_hardware_and_aborted_runs_are_marked(tmp_path):
     text = write_report(make_run(tmp_path / "run", simulated=False, partial=True, lean=True)).read_text()
     assert ">HARDWARE<" in text
     assert "ABORTED BY THE OPERATOR" in text
@@ -335,6 +335,6 @@ def test_picture_of_a_run(tmp_path):
     assert not (tmp_path / "none.png").exists()
 
 
-def test_sky_time_is_told_in_words_too(page):
+def test_sky_time_is_printed_in_words_too(page):
     assert "rms over 20 random registrations" in page
     assert "Fewest frames that meet every goal: whitened 500, unwhitened none of these." in page

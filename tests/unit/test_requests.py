@@ -1,4 +1,4 @@
-"""What a caller may say to a server, before anything is sent."""
+"""Checks of requests before they are sent to a server."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Rings of arrays in shared memory, seen from one process."""
+"""Rings of arrays in shared memory, used from one process."""
 
 from __future__ import annotations
 
@@ -132,7 +132,7 @@ def test_indices_that_begin_anew_count_as_newer(writer: RingWriter) -> None:
         assert sample.index == 0
 
 
-def test_the_header_tells_rate_and_size(writer: RingWriter) -> None:
+def test_the_header_states_rate_and_size(writer: RingWriter) -> None:
     with RingReader(writer.name) as reader:
         for number in range(101):
             writer.write(np.ones((2, 3), np.float32), number, arrived_ns=1 + 2_000_000 * number)
@@ -143,7 +143,7 @@ def test_the_header_tells_rate_and_size(writer: RingWriter) -> None:
         assert reader.alive
 
 
-def test_a_closed_ring_is_gone_for_those_who_come_and_legible_for_those_who_look() -> None:
+def test_a_closed_ring_is_absent_for_new_readers_and_readable_for_present_ones() -> None:
     writer = RingWriter(segment_name("test.ring", "psf"), 64)
     writer.write(np.ones(3), 4)
     with RingReader(writer.name) as reader:

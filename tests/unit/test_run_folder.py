@@ -1,4 +1,4 @@
-"""A run's folder: made before anything moves, never over another run."""
+"""A run's folder: created before anything moves, never over another run."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a client may say to a procedure, and what becomes of errors on the wire."""
+"""Arguments of procedures from clients, and the transfer of errors."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def test_what_is_wrong_is_named(said: dict, message: str) -> None:
     assert str(error.value) == message
 
 
-def test_all_that_is_wrong_is_told_at_once() -> None:
+def test_all_that_is_wrong_is_reported_together() -> None:
     with pytest.raises(ConfigError, match=r"frames is 0.*poke is -1"):
         check_arguments(PARAMETERS, {"frames": 0, "poke": -1})
 

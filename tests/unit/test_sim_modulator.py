@@ -1,4 +1,4 @@
-"""The modulator's twin: a clock that rounds, a slow start, and a circle that is not quite one."""
+"""The modulator's twin: rounding of the frequency, a slow start, and an imperfect circle."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def test_a_system_without_a_modulator_has_no_twin_of_one() -> None:
         make_modulator("stage", load_system("razor-shwfs"), {})
 
 
-def test_circle_is_the_one_that_was_asked_for_when_nothing_is_wrong() -> None:
+def test_circle_is_the_requested_one_when_nothing_is_wrong() -> None:
     ideal = circle("twin.pyramid.ellipse=0", "twin.pyramid.phase=0", "twin.pyramid.drift=0")
     points = ideal.points()
     assert len(points.points) == 20

@@ -1,4 +1,4 @@
-"""The compiled centre of gravity against one written out in NumPy."""
+"""The compiled centre of gravity against a NumPy implementation."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The SPRINT benchmark: what is compared, and what happens where a peer is missing."""
+"""The SPRINT benchmark: the compared quantities, and rows for missing peers."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def test_on_the_pyramid_both_solve_oopaos_matrix_and_ours_is_nearer():
     )
     assert (mine < [0.02, 0.02, 1e-4, 1e-3, 1e-3]).all()
     assert (other < [0.2, 0.2, 1e-3, 0.05, 0.05]).all()
-    # What is planted is the same share of the pupil on both sensors.
+    # What is injected is the same share of the pupil on both sensors.
     assert at.shift_x / config.sensor.n_sub == pytest.approx(sprint.INJECTED.shift_x / sprint.INJECTED_N_SUB)
 
 
@@ -75,7 +75,7 @@ def test_a_real_mirror_differs_from_the_ideal_one():
     assert real.coupling != ideal.coupling
 
 
-def test_without_specula_there_is_a_row_that_says_so(monkeypatch, alike, modes):
+def test_without_specula_there_is_a_row_that_states_it(monkeypatch, alike, modes):
     monkeypatch.setattr(sprint, "specula_peer", lambda *given: None)
     monkeypatch.setattr(sprint, "time_alternately", lambda ours, peer, **given: (ours() and 1.0, None))
     (row,) = sprint._specula_rows(alike, modes)
@@ -85,14 +85,14 @@ def test_without_specula_there_is_a_row_that_says_so(monkeypatch, alike, modes):
     assert math.isfinite(row.ours)
 
 
-def test_far_answers_count_as_found_only_when_right_and_vouched_for(monkeypatch, alike, modes):
+def test_results_far_away_count_only_when_correct_and_valid(monkeypatch, alike, modes):
     class Lost:
         """Always says zero; vouches for it every other time."""
 
         name, m2c, calls = "lost", modes, 0
 
         def matrix(self, registration, real):
-            self.planted = registration
+            self.injected = registration
             return registration.to_array()
 
         def solve(self, data, iterations):

@@ -1,4 +1,4 @@
-"""Standard errors of correlated series against the error that is known."""
+"""Standard errors of correlated series against the known error."""
 
 from __future__ import annotations
 

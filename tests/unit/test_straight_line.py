@@ -1,4 +1,4 @@
-"""Straight lines through estimates that fade: no lag, honest errors, innovations."""
+"""Straight lines through exponentially weighted estimates: no lag, correct errors, innovations."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def follow(truth, noise, *, fastest=0.5, static=0.0):
 
 
 def test_a_line_is_followed_without_lag():
-    # Updates hold the mean over their second, and the truth now is half a second later.
+    # Updates hold the mean over their second, and the true values now is half a second later.
     truth = 0.2 * (np.arange(60) + 0.5)
     found = follow(truth, np.zeros(60))
     errors = np.array([one.value[0] for one in found]) - 0.2 * (np.arange(60) + 1.0)
@@ -36,7 +36,7 @@ def test_a_line_is_followed_without_lag():
 
 @pytest.mark.parametrize("rate", [0.0, 0.3])
 @pytest.mark.parametrize("at", [2, 6, 40])
-def test_errors_are_honest_while_the_memory_fills_and_after(rate, at):
+def test_errors_are_correct_while_the_memory_fills_and_after(rate, at):
     rng = np.random.default_rng(7)
     pulls = []
     for _ in range(200):
@@ -53,7 +53,7 @@ def test_what_does_not_change_is_not_averaged_away():
     assert last.random_covariance[0, 0] < 0.03
 
 
-def test_a_jump_is_a_surprise_and_noise_is_none():
+def test_a_jump_has_a_large_innovation_and_noise_has_none():
     rng = np.random.default_rng(3)
     truth = np.zeros(50)
     truth[40:] = 10.0

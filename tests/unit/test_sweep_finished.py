@@ -1,4 +1,4 @@
-"""A sweep with nothing left to run is shown where its result lies, and makes no other folder."""
+"""A sweep with nothing left to run shows its result, and creates no other folder."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def conclude_in(path: Path, description: SweepDescription, partial: bool = False
     return path
 
 
-def test_what_is_broken_off_is_not_finished(description: SweepDescription, tmp_path: Path) -> None:
+def test_an_interrupted_run_is_not_finished(description: SweepDescription, tmp_path: Path) -> None:
     assert find_finished_result(tmp_path / "run", description) is None
     conclude_in(tmp_path / "run", description, partial=True)
     assert find_finished_result(tmp_path / "run", description) is None

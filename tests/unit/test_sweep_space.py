@@ -1,4 +1,4 @@
-"""What a sweep varies: the texts that say it, the draws, and what is refused before anything opens."""
+"""Search space of a sweep: its text form, the draws, and errors before anything opens."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def test_no_two_stages_share_their_turbulence():
     )
 
 
-def test_a_lucky_loop_is_not_shortlisted_before_a_good_neighbourhood():
+def test_a_single_good_loop_is_not_shortlisted_before_a_good_neighbourhood():
     space = (Range("gain", 0.0, 1.0),)
     rng = np.random.default_rng(1)
     records = []

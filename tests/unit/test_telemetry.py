@@ -1,4 +1,4 @@
-"""Slopes and pokes on one time line: a lost frame loses its pairs and shifts none."""
+"""Slopes and pokes on one time line: a lost frame removes its pairs and shifts none."""
 
 from __future__ import annotations
 

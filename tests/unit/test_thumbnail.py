@@ -1,4 +1,4 @@
-"""What notebooks show: pictures that decode, numbers with units and provenance, nothing unescaped."""
+"""Notebook output: valid images, numbers with units and provenance, escaped text."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from escape_hw.remote.state import FaultState, LoopState, Phase, State
 
 def pixels(html: str) -> np.ndarray:
     data = base64.b64decode(re.search(r"base64,([^\"]+)", html)[1])
-    return np.round(255 * matplotlib.image.imread(io.BytesIO(data), "png")).astype(int)
+    return np.round(255 * matplotlib.image.imread(io.BytesIO(data), "png")[..., :3]).astype(int)
 
 
 def matrix() -> InteractionMatrix:
@@ -61,7 +61,7 @@ def test_a_table_escapes_what_it_is_given() -> None:
     assert "&lt;script&gt;" in table_html({"x": "<script>"})
 
 
-def test_a_matrix_tells_units_errors_and_where_it_is_from() -> None:
+def test_a_matrix_states_units_errors_and_where_it_is_from() -> None:
     html = matrix()._repr_html_()
     assert "docrime" in html
     assert "a &lt;b&gt; (SIMULATED)" in html
@@ -78,7 +78,7 @@ def estimate() -> RegistrationEstimate:
     )  # fmt: skip
 
 
-def test_a_registration_tells_errors_units_and_convergence() -> None:
+def test_a_registration_states_errors_units_and_convergence() -> None:
     html = estimate()._repr_html_()
     assert "1.500 ± 0.200 % of a sub-aperture" in html
     assert "yes, 4 iterations" in html

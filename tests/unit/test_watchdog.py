@@ -43,7 +43,7 @@ def engine() -> Engine:
     return Engine()
 
 
-def test_a_good_loop_is_left_alone_for_an_hour(engine: Engine) -> None:
+def test_a_good_loop_is_not_opened_for_an_hour(engine: Engine) -> None:
     for _ in range(60):
         assert engine.tell(50, residual=40) is None
         # A gust, and some actuators at their limits for a moment.
@@ -51,7 +51,7 @@ def test_a_good_loop_is_left_alone_for_an_hour(engine: Engine) -> None:
         assert engine.tell(0.8, clipped=0.9) is None
 
 
-def test_a_run_that_closes_a_loop_of_its_own_is_not_held_against_the_one_before(engine: Engine) -> None:
+def test_a_run_that_closes_a_loop_of_its_own_is_not_compared_with_the_one_before(engine: Engine) -> None:
     assert engine.tell(20, residual=60) is None
     # No state came between the two loops.
     assert engine.tell(20, residual=250, run=5) is None
@@ -62,7 +62,7 @@ def test_a_run_that_closes_a_loop_of_its_own_is_not_held_against_the_one_before(
     assert "the residual grew" in violation.reason
 
 
-def test_a_loop_that_a_run_closes_again_is_not_held_against_its_round_before(engine: Engine) -> None:
+def test_a_loop_that_a_run_closes_again_is_not_compared_with_its_round_before(engine: Engine) -> None:
     assert engine.tell(20, residual=60, run=5) is None
     # Opened, the mirror flat, and closed at a lower gain: no state came in between.
     assert engine.tell(20, residual=250, run=5, flattened=2) is None
@@ -110,7 +110,7 @@ def test_a_residual_that_grows_is_detected_at_any_publishing_rate(every: float) 
     assert "times its median of 50 nm" in violation.reason
 
 
-def test_states_told_out_of_turn_weigh_no_more(engine: Engine) -> None:
+def test_states_published_out_of_turn_have_no_more_weight(engine: Engine) -> None:
     assert engine.tell(10, residual=50) is None
     # As when many requests publish states while the residual is high.
     engine.every = 0.001
@@ -135,7 +135,7 @@ def test_a_residual_before_the_loop_was_closed_does_not_count(engine: Engine) ->
     assert engine.tell(10, residual=300) is None
 
 
-def test_a_residual_told_again_is_none_to_go_by(engine: Engine) -> None:
+def test_a_repeated_residual_is_not_used(engine: Engine) -> None:
     # As before a procedure closes its own loop, which begins with the whole turbulence.
     engine.published += 1
     assert engine.tell(60, residual=60, fresh=False) is None

@@ -1,4 +1,4 @@
-"""The whitening filter: what the past predicts, whatever is missing."""
+"""The whitening filter: prediction from the past, also with missing frames."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def test_lost_frames_do_not_spoil_the_filter(lost):
     assert fit_prediction_error_filter(broken, present, 4) == pytest.approx(whole, abs=0.05)
 
 
-def test_noise_asks_for_a_longer_memory():
+def test_noise_needs_a_longer_memory():
     # Sensor noise hides the last frame's turbulence; older frames then help.
     x = process(PROCESSES["AR(1)"], noise=3.0)
     left = []

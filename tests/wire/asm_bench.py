@@ -1,4 +1,4 @@
-"""An emulated adaptive secondary and its driver, and clients that misbehave."""
+"""An emulated adaptive secondary and its driver, and misbehaving clients."""
 
 from __future__ import annotations
 

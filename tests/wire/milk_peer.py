@@ -1,4 +1,4 @@
-"""milk's own library (ImageStreamIO 2.x), as the other side of tests; as a program, in a process of its own.
+"""milk's own library (ImageStreamIO 2.x), as the peer in tests; as a program, in a separate process.
 
 ``python milk_peer.py write NAME PERIOD_S COUNT`` writes ramps at a steady rate, ``echo IN OUT COUNT`` waits
 for the image ``IN`` through the library and copies every array to ``OUT``. Both print a line once ready.

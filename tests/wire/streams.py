@@ -1,4 +1,4 @@
-"""Streams filled by somebody else, for tests of the devices that read and write them."""
+"""Streams filled by another writer, for tests of the devices that read and write them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the ALPAO driver says to libasdk, call by call, and what it makes of every answer."""
+"""Calls of the ALPAO driver to libasdk, and its handling of every reply."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def test_every_call_of_a_session_in_order(asdk) -> None:
     assert not asdk.violations
 
 
-def test_a_stand_in_is_never_taken_for_metal(asdk) -> None:
+def test_a_stand_in_is_never_taken_for_hardware(asdk) -> None:
     with make("alpao") as dm:
         assert dm.info.simulated
         assert dm.info.model == "ALPAO mirror, SDK 3.04.05.0612 (stand-in)"
@@ -65,14 +65,14 @@ def test_wrong_options_are_refused_before_anything_is_loaded() -> None:
         make("alpao", "devices.dm.options.trigger=rising", "devices.dm.options.ack_timeout_ms=1.5")
     text = str(refused.value)
     assert "devices.dm.options.trigger: unknown option (did you mean 'trigger_in'?" in text
-    assert "devices.dm.options.ack_timeout_ms: 1.5  must be of type int" in text
+    assert "devices.dm.options.ack_timeout_ms: 1.5  must be a valid integer" in text
     with pytest.raises(ConfigError, match=r"options\.ack_timeout_ms: -1  is out of range"):
         make("alpao", "devices.dm.options.ack_timeout_ms=-1")
     with pytest.raises(ConfigError, match="by its serial number only"):
         make("alpao", 'devices.dm.serial=""')
 
 
-def test_a_missing_library_says_where_it_was_looked_for(monkeypatch) -> None:
+def test_a_missing_library_names_the_searched_places(monkeypatch) -> None:
     dm = make("alpao", 'devices.dm.options.library=""')
     monkeypatch.setenv("ESCAPE_ALPAO_LIBRARY", "/nowhere/libasdk.so")
     with pytest.raises(DeviceError, match=r"/nowhere/libasdk\.so.*option 'library'.*ESCAPE_ALPAO_LIBRARY"):
@@ -85,13 +85,13 @@ def test_a_missing_library_says_where_it_was_looked_for(monkeypatch) -> None:
         dm.open()
 
 
-def test_another_library_is_told_from_the_sdk() -> None:
+def test_another_library_is_distinguished_from_the_sdk() -> None:
     with pytest.raises(DeviceError, match="does not export asdkInit"):
         make("alpao", "devices.dm.options.library=libm.so.6").open()
 
 
 @pytest.mark.parametrize("peeks", [0, 1])
-def test_a_failed_init_says_why_and_is_never_reset(asdk, peeks) -> None:
+def test_a_failed_init_gives_the_reason_and_is_never_reset(asdk, peeks) -> None:
     asdk.script(f"set errors_stay {peeks}; asdkInit 1 error 0x22; asdkInit 2 invalid_handle 0x20")
     dm = make("alpao")
     with pytest.raises(DeviceError, match=r"error 0x22, no interface in the configuration.*ACECFG"):
@@ -152,12 +152,12 @@ def test_patterns_reach_the_electronics_and_stop_before_anything_else(asdk) -> N
     wave = 0.01 * np.sin(np.arange(8) / 8 * 2 * np.pi)[:, None] * np.ones(97)
     with make("alpao") as dm:
         dm.play_patterns(wave, repeats=0)
-        assert dm.is_playing
+        assert dm._playing
         dm.play_patterns(wave, repeats=3)
         assert asdk.calls[3:] == ["asdkSendPattern 8 0", "asdkStop", "asdkSendPattern 8 3"]
         dm.send(np.zeros(97))
         assert asdk.names()[6:] == ["asdkStop", "asdkSend"]
-        assert not dm.is_playing
+        assert not dm._playing
         dm.play_patterns(wave, repeats=0)
     assert asdk.names()[-5:] == ["asdkStop", "asdkSend", "asdkStop", "asdkReset", "asdkRelease"]
     assert not asdk.violations

@@ -1,4 +1,4 @@
-"""AOT files through aotpy: what goes out comes back, and its own checks are content."""
+"""AOT files through aotpy: written data are read back, and its own checks pass."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ def test_a_file_that_is_not_ours_is_read_by_the_standard_alone(tmp_path: Path) -
     assert found.telemetry is None
 
 
-def test_what_cannot_be_is_refused_in_words(tmp_path: Path) -> None:
+def test_what_cannot_be_is_refused_with_a_message(tmp_path: Path) -> None:
     result = lenslets()
     record = telemetry(result)
     wrong = replace(record, slopes=record.slopes[:, :-2])

@@ -1,4 +1,4 @@
-"""What the Aravis driver says to libaravis, what it makes of every answer, and Aravis's own fake cameras."""
+"""Calls of the Aravis driver to libaravis, its handling of every reply, and Aravis's fake cameras."""
 
 from __future__ import annotations
 
@@ -258,7 +258,7 @@ def test_the_fake_cameras_counter_starts_over() -> None:
 
 
 @needs_aravis
-def test_the_fake_camera_says_that_it_is_no_metal() -> None:
+def test_the_fake_camera_reports_that_it_is_simulated() -> None:
     with make("aravis", *FAKE) as camera:
         assert camera.info.simulated
         assert camera.info.model == "Fake (stand-in)"

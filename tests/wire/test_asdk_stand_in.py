@@ -1,4 +1,4 @@
-"""The stand-in of libasdk by itself: it catches a driver that an obliging one would let through."""
+"""The stand-in of libasdk by itself: it detects violations that a tolerant one would accept."""
 
 from __future__ import annotations
 
@@ -126,7 +126,7 @@ def test_the_error_stack_goes_by_reading_the_text_only(asdk, c) -> None:
     assert [last(c) for _ in range(3)] == [(0, 0x24)] * 3
 
 
-def test_faults_come_at_the_call_they_were_asked_for(asdk, c) -> None:
+def test_faults_come_at_the_requested_call(asdk, c) -> None:
     asdk.script("asdkSend 2 error 0x104\nasdkSend 3..4 ignore; asdkSend 5 timeout 1; asdkStop 1 unplug")
     handle = init(c)
     ones = ZEROS + 0.5

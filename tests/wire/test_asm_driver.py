@@ -1,4 +1,4 @@
-"""The driver of an adaptive secondary over a real socket: contract, and every call that arrives."""
+"""The driver of an adaptive secondary over a real socket: contract, and every call received."""
 
 from __future__ import annotations
 
@@ -113,21 +113,21 @@ def test_acknowledgements_bring_positions_and_times() -> None:
     with emulator() as made, driver(port_of(made)) as mirror:
         shape = 0.02 * _enabled(mirror)
         mirror.send(shape)
-        ack = mirror.last_ack
+        ack = mirror._ack
         assert ack is not None
         assert ack.result is m.Result.APPLIED
         assert 0 < ack.received_ns <= ack.applied_ns
         wait_for(lambda: bool(np.allclose(mirror.measured_positions(), shape, atol=3e-3)), "it moved")
 
 
-def test_a_blind_sensor_is_nan_and_no_other() -> None:
+def test_a_failed_sensor_is_nan_and_no_other() -> None:
     with emulator() as made, driver(port_of(made)) as mirror:
         made.inject("unreadable:5")
         wait_for(lambda: bool(np.isnan(mirror.measured_positions()[5])), "the sensor went blind")
         assert np.isnan(mirror.measured_positions()).sum() == 1
 
 
-def test_a_skipped_command_keeps_the_shape_and_says_so() -> None:
+def test_a_skipped_command_keeps_the_shape_and_is_reported() -> None:
     with emulator() as made, driver(port_of(made)) as mirror:
         made.inject("skip")
         skipped = mirror.send(0.02 * _enabled(mirror))
@@ -158,7 +158,7 @@ def test_a_mirror_that_skips_on_and_on_opens_the_loop() -> None:
             mirror.send(np.zeros(336))
 
 
-def test_a_mirror_left_set_stays_set_and_is_found_so() -> None:
+def test_a_mirror_left_set_stays_set() -> None:
     with emulator() as made:
         with driver(port_of(made)) as mirror:
             mirror.leave_set = True
@@ -168,7 +168,7 @@ def test_a_mirror_left_set_stays_set_and_is_found_so() -> None:
         assert made.violations == ()
 
 
-def test_many_may_look_while_one_controls() -> None:
+def test_many_may_observe_while_one_controls() -> None:
     with emulator() as made, driver(port_of(made)) as owner:
         others = [driver(port_of(made)) for _ in range(5)]
         for other in others:
@@ -234,10 +234,10 @@ def test_new_contamination_is_reported_with_the_line_to_configure() -> None:
     ("word", "message"),
     [
         ("hots=x", "did you mean 'host'"),
-        ("port=0", "allowed range 1 to 65535"),
-        ("reply_s=-1.0", "reply_s: -1  is out of range"),
+        ("port=0", "allowed range 1 <= x <= 65535"),
+        ("reply_s=-1.0", "reply_s: -1.0  is out of range"),
         ("max_skips=0", "max_skips: 0  is out of range"),
-        ("lift=1", "type bool"),
+        ("lift=1", "must be a valid boolean"),
     ],
 )
 def test_wrong_options_are_refused(word: str, message: str) -> None:
@@ -267,7 +267,7 @@ def test_another_codec_replaces_only_the_codec() -> None:
     assert Counting.made >= 1
 
 
-def test_watching_says_nothing_on_a_quiet_link(caplog: pytest.LogCaptureFixture) -> None:
+def test_observation_sends_nothing_on_a_quiet_link(caplog: pytest.LogCaptureFixture) -> None:
     with emulator() as made, driver(port_of(made), heartbeat_s=0.02) as mirror:
         seen = len(made.server.calls)
         wait_for(lambda: len(made.server.calls) > seen + 3, "signs of life")

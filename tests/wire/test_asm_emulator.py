@@ -1,4 +1,4 @@
-"""The emulated adaptive secondary is strict: what a careless client does is refused and written down."""
+"""The emulated adaptive secondary is strict: violations of a client are refused and recorded."""
 
 from __future__ import annotations
 
@@ -254,7 +254,7 @@ def test_sound_frames_with_nonsense_in_them_are_answered(kind: int, payload: byt
     connection.data_received(command(3, 1, 1e-7))
     # Whatever it was, the mirror may have been stepped down, no more than that.
     assert made.controller.applied == int(
-        made.controller.shell.state is ShellState.RUNNING and not made.controller.is_changing_state
+        made.controller.shell.state is ShellState.RUNNING and made.controller._transition is None
     )
 
 
@@ -283,8 +283,8 @@ def test_an_observer_that_does_not_read_gets_only_the_newest() -> None:
         ({"fault": "explode@3"}, "write one of"),
         ({"fault": "skip"}, "KIND@NUMBER"),
         ({"fault": "contaminate:x@1"}, "not a number"),
-        ({"transition_speed": "0"}, "must be positive"),
-        ({"versions": "1"}, "LOWEST,HIGHEST"),
+        ({"transition_speed": "0"}, "transition_speed=0: must be greater than 0"),
+        ({"versions": "1"}, "versions=1: String should match"),
     ],
 )
 def test_wrong_options_are_refused(options: dict[str, str], words: str) -> None:

@@ -1,4 +1,4 @@
-"""Every failure of the link to an adaptive secondary ends in the promised state and is reported."""
+"""Every failure of the link to an adaptive secondary ends in the documented state and is reported."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ SAFE = (ShellState.OFF, ShellState.RESTED, ShellState.SET)
 
 
 def session(mirror: AsmMirror) -> None:
-    """Everything that a driver is asked for."""
+    """All requests to a driver."""
     with mirror:
         for k in range(3):
             mirror.send(0.01 * k * np.ones(336))
@@ -102,7 +102,7 @@ def test_a_link_comes_back_by_itself_and_nothing_is_sent_again() -> None:
         assert not [c for c in made.violations if "refused" in c]
 
 
-def test_a_command_into_a_broken_link_is_lost_and_says_so() -> None:
+def test_a_command_into_a_broken_link_is_lost_and_is_reported() -> None:
     with emulator() as made:
         mirror = driver(port_of(made)).open()
         sent = made.controller.applied
@@ -233,7 +233,7 @@ def test_an_unplugged_mirror_is_reported_and_recovers() -> None:
 
 
 # --------------------------------------------------------------------- the mirror stops itself
-def test_silence_is_first_held_and_then_rested() -> None:
+def test_after_silence_the_shape_is_held_and_then_the_shell_rested() -> None:
     with emulator(hold_s=0.1, rest_s=1.0) as made:
         mirror = driver(port_of(made), heartbeat_s=600.0).open()
         wait_for(
@@ -248,7 +248,7 @@ def test_silence_is_first_held_and_then_rested() -> None:
             mirror.close()
 
 
-def test_signs_of_life_keep_a_shell_afloat() -> None:
+def test_heartbeats_keep_a_shell_floating() -> None:
     with emulator(hold_s=1.0, rest_s=2.0) as made, driver(port_of(made), heartbeat_s=0.05) as mirror:
         time.sleep(2.5)
         assert mirror.state is ShellState.RUNNING
@@ -285,7 +285,7 @@ def test_a_cause_that_persists_is_not_cleared() -> None:
         mirror.go_to(ShellState.RUNNING)
 
 
-def test_dust_on_the_way_stops_the_work_and_says_what_to_configure() -> None:
+def test_dust_on_the_way_stops_the_work_and_states_what_to_configure() -> None:
     with emulator() as made:
         with driver(port_of(made)) as mirror:
             made.inject("contaminate:30")
@@ -295,7 +295,7 @@ def test_dust_on_the_way_stops_the_work_and_says_what_to_configure() -> None:
             driver(port_of(made)).open()
 
 
-def test_a_fault_of_another_hour_is_heard_while_nothing_is_sent() -> None:
+def test_a_fault_is_received_while_nothing_is_sent() -> None:
     with emulator() as made, driver(port_of(made), heartbeat_s=0.02) as mirror:
         made.inject("trip")
         wait_for(lambda: mirror._last_state is ShellState.FAULT, "the sign of life has brought the news")

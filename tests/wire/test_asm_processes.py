@@ -53,7 +53,7 @@ def remote() -> Iterator[tuple[subprocess.Popen[str], int]]:
         yield process, int(found[1])
 
 
-def test_a_peer_that_is_stopped_is_told_in_time_and_rests_when_it_goes_on(
+def test_a_stopped_peer_is_reported_in_time_and_rests_when_it_continues(
     remote: tuple[subprocess.Popen[str], int],
 ) -> None:
     process, port = remote
@@ -76,7 +76,7 @@ def test_a_peer_that_is_stopped_is_told_in_time_and_rests_when_it_goes_on(
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
-def test_a_client_that_dies_or_hangs_leaves_the_shell_at_rest(number: signal.Signals) -> None:
+def test_a_client_that_ends_or_hangs_leaves_the_shell_at_rest(number: signal.Signals) -> None:
     with emulator(hold_s=0.3, rest_s=1.5) as made:
         words = [sys.executable, "-c", _CLIENT, str(port_of(made))]
         with ended(subprocess.Popen(words, stdout=subprocess.PIPE, text=True)) as client:
@@ -90,7 +90,7 @@ def test_a_client_that_dies_or_hangs_leaves_the_shell_at_rest(number: signal.Sig
                 assert mirror.state is ShellState.RUNNING
 
 
-def test_the_command_tells_what_a_client_did_wrong(remote: tuple[subprocess.Popen[str], int]) -> None:
+def test_the_command_states_what_a_client_did_wrong(remote: tuple[subprocess.Popen[str], int]) -> None:
     process, port = remote
     from asm_bench import RawClient, frame
 

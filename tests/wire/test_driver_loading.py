@@ -1,4 +1,4 @@
-"""When vendors' libraries are loaded, and what ``escape perf`` says of the drivers."""
+"""Loading of vendors' libraries, and the rows of ``escape perf`` for the drivers."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def test_nothing_is_loaded_before_open(driver: str, key: str) -> None:
     assert done.stdout == "False\n", done.stderr
 
 
-def test_every_driver_stands_beside_the_direct_call(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_driver_is_compared_with_the_direct_call(monkeypatch: pytest.MonkeyPatch) -> None:
     stand_in("asdk"), stand_in("m3api")
     monkeypatch.setattr(
         drivers, "time_alternately", lambda ours, peer, seconds: (ours(), peer()) and (3e-6, 2e-6)
@@ -40,7 +40,7 @@ def test_every_driver_stands_beside_the_direct_call(monkeypatch: pytest.MonkeyPa
         assert math.isfinite(float(row.note.split()[-2]))
 
 
-def test_without_a_compiler_the_stage_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_compiler_the_stage_gives_the_reason(monkeypatch: pytest.MonkeyPatch) -> None:
     def none(name: str) -> None:
         raise StandInUnavailable("no C compiler found")
 

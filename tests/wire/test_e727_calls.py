@@ -1,4 +1,4 @@
-"""What the driver says to the controller, call by call: order, units, values."""
+"""Commands of the driver to the controller: order, units, values."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import time
 
 import numpy as np
 import pytest
+from usb_bus import pulses_s
 
 from escape_drivers.pi.modulator import PiModulator, make_modulator
 from escape_hw.api.emulator import EmulatorRequest
@@ -96,7 +97,7 @@ def test_a_circle_is_written_started_at_once_and_triggered(emulator):
             "WSL 1 1 2 2", "WGC 1 0 2 0", "WOS 1 0 2 0", "WTR 1 1 0 2 1 0", "MOV 1 1141 2 1000",
             "TWC", "TWS 1 1 1", "TWS 1 34 0", "CTO 1 3 4", "WGO 1 1 2 1",
         )  # fmt: skip
-        assert emulator.controller.waves.pulses_s(1, "1") == pytest.approx([0.0])
+        assert pulses_s(emulator.controller, 1, "1") == pytest.approx([0.0])
         stage.park()
         assert emulator.controller.state.describe() == "servo on"
     assert emulator.violations == ()
@@ -169,7 +170,7 @@ def test_axes_may_be_crossed_reversed_and_weak(emulator):
         assert tables[2] == pytest.approx(1000 + 200 * np.sin(angle))
 
 
-def test_looking_at_a_closed_stage_moves_nothing(emulator):
+def test_status_of_a_closed_stage_moves_nothing(emulator):
     stage = driver(emulator)
     status = stage.status()
     assert said(emulator) == ["ERR?"]

@@ -1,9 +1,10 @@
-"""The emulated E-727 is strict: it obeys its manual, and tells what a careless client does."""
+"""The emulated E-727 is strict: it follows its manual, and reports violations."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
+from usb_bus import UsbPipe, pulses_s
 
 from escape_hw.api.emulator import EmulatorRequest
 from escape_hw.errors import ConfigError
@@ -12,7 +13,8 @@ from escape_sim.emulators.e727.controller import E727Controller
 from escape_sim.emulators.e727.emulator import make_emulator
 from escape_sim.emulators.e727.stage import SERVO_S
 from escape_sim.emulators.e727.state import ControllerSettings
-from escape_sim.emulators.e727.transports import FaultInjector, UsbPipe, parse_fault_script
+from escape_sim.emulators.e727.transports import FaultInjector, parse_fault
+from escape_sim.emulators.options import parse_fault_script
 
 
 class Client:
@@ -109,7 +111,7 @@ def test_auto_zero_takes_its_time_and_the_full_range():
     assert client.say("ATZ? 1") == "1=1\n"
 
 
-def test_a_failed_auto_zero_says_so():
+def test_a_failed_auto_zero_is_reported():
     client = Client(zeroed=False)
     client.controller.state.axes["1"].zero_failed = True
     assert client.error("ATZ 1 NaN") == 0
@@ -118,7 +120,7 @@ def test_a_failed_auto_zero_says_so():
     assert client.say("ERR?") == "98\n"
 
 
-def test_errors_have_to_be_asked_for(client):
+def test_errors_have_to_be_requested(client):
     client.say("SVO 1 1")
     client.say("SVO 2 1")
     assert client.violations == ["no ERR? after 'SVO 1 1' (then: 'SVO 2 1')"]
@@ -190,7 +192,7 @@ def test_a_start_far_from_the_first_point_is_a_jump(servo):
     assert servo.violations == ["WGO 1 starts with a jump of 400.0 urad; MOV there first"]
 
 
-def test_a_turning_axis_takes_no_other_orders(servo):
+def test_a_turning_axis_accepts_no_other_commands(servo):
     circle(servo)
     assert servo.error("WGO 1 1 2 1") == 0
     for command in ("MOV 1 1000", "SVO 1 0", "WSL 1 2", "WAV 1 X PNT 1 1 5", "WCL 1", "WGO 1 1"):
@@ -229,12 +231,12 @@ def test_pulses_come_where_the_trigger_says(servo):
     circle(servo)
     for command in ("TWC", "TWS 1 11 1", "TWS 1 31 0", "CTO 1 3 4"):
         assert servo.error(command) == 0
-    assert servo.controller.waves.pulses_s(1, "1").size == 0, "no wave, no pulse"
+    assert pulses_s(servo.controller, 1, "1").size == 0, "no wave, no pulse"
     assert servo.error("WGO 1 1 2 1") == 0
-    assert servo.controller.waves.pulses_s(1, "1") == pytest.approx([10 * 50e-6])
-    assert servo.controller.waves.pulses_s(2, "1").size == 0
+    assert pulses_s(servo.controller, 1, "1") == pytest.approx([10 * 50e-6])
+    assert pulses_s(servo.controller, 2, "1").size == 0
     assert servo.error("CTO 1 3 0") == 0
-    assert servo.controller.waves.pulses_s(1, "1").size == 0
+    assert pulses_s(servo.controller, 1, "1").size == 0
 
 
 def test_replies_have_the_manuals_form(servo):
@@ -268,10 +270,10 @@ def test_usb_transfers_are_even():
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        ({"colour": "red"}, "e727 has no option 'colour'; it has serial, auto-zero, zeroed, fault"),
-        ({"auto-zero": "soon"}, "auto-zero=soon: not a number of seconds"),
-        ({"auto-zero": "-1"}, "must lie in 0..600 seconds"),
-        ({"zeroed": "yes"}, "write 0 or 1"),
+        ({"colour": "red"}, "--option colour: unknown; this emulator has serial, auto-zero, zeroed, fault"),
+        ({"auto-zero": "soon"}, "auto-zero=soon: must be a valid number"),
+        ({"auto-zero": "-1"}, "auto-zero=-1: must be greater than 0"),
+        ({"zeroed": "yes"}, "zeroed=yes: must be '0' or '1'"),
         ({"fault": "close"}, "fault 'close': write KIND@NUMBER"),
         ({"fault": "melt@3"}, "KIND one of drop_command, drop_reply"),
     ],
@@ -289,11 +291,11 @@ def test_a_port_in_use_is_reported():
 
 
 def test_faults_are_read_from_text():
-    assert parse_fault_script("drop_reply@12,close@40") == {12: "drop_reply", 40: "close"}
+    assert parse_fault_script("drop_reply@12,close@40", parse_fault) == {12: "drop_reply", 40: "close"}
 
 
 def test_fault_words_of_version_0_1_0_are_accepted(capsys):
-    assert parse_fault_script("lose@1,drop@2,late@3,power@4") == {
+    assert parse_fault_script("lose@1,drop@2,late@3,power@4", parse_fault) == {
         1: "drop_command", 2: "drop_reply", 3: "delay", 4: "power_cut",
     }  # fmt: skip
     assert capsys.readouterr().err.splitlines()[0] == (

@@ -98,7 +98,7 @@ def test_a_floating_shell_is_flattened_and_rested(tmp_path: Path) -> None:
         wait_for(lambda: made.controller.shell.state is ShellState.RESTED, "the shell is rested")
 
 
-def test_a_shell_that_went_to_rest_by_itself_is_not_lifted(tmp_path: Path) -> None:
+def test_a_shell_rested_by_its_watchdog_is_not_lifted(tmp_path: Path) -> None:
     states = []
     with emulator(hold=1.0, rest=2.0) as made:
         port = port_of(made)

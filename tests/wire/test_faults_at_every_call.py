@@ -1,4 +1,4 @@
-"""A fault at each call of a session in turn: an error that helps, a closed device, a safe mirror."""
+"""A fault at each call of a sequence in turn: an error with a remedy, a closed device, a safe mirror."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ def test_a_fault_at_each_call(driver: str, action: str) -> None:
     ("driver", "call"),
     [("alpao", "asdkSend"), ("ximea", "xiGetImage"), ("aravis", "arv_stream_timeout_pop_buffer")],
 )
-def test_an_unplugged_device_says_so_and_what_to_do(driver: str, call: str) -> None:
+def test_an_unplugged_device_is_reported_with_a_remedy(driver: str, call: str) -> None:
     library = fresh(PARTS[driver][1])
     device = make(driver).open()
     library.script(f"{call} 1 unplug")

@@ -1,4 +1,4 @@
-"""Framing and parsing of the General Command Set, at both ends, whatever the wire makes of it."""
+"""Framing and parsing of the General Command Set, at both ends, for any fragmentation."""
 
 from __future__ import annotations
 
@@ -128,7 +128,7 @@ def test_lines_are_short_and_finite():
         pi_gcs.format_command("MOV", "1", float("nan"))
 
 
-def test_every_refusal_says_what_to_do_and_crosses_to_another_process():
+def test_every_refusal_states_what_to_do_and_crosses_to_another_process():
     import pickle
 
     for number in (7, 98, 4711):
@@ -165,7 +165,7 @@ SAID = st.tuples(
 
 @given(st.lists(SAID, max_size=12))
 @settings(max_examples=60, deadline=None)
-def test_any_words_get_an_answer_or_an_error(said):
+def test_any_text_gets_a_reply_or_an_error(said):
     now = [0.0]
     controller = E727Controller(ControllerSettings(zeroed=True), clock=lambda: now[0])
     for name, words in said:

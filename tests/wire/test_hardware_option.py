@@ -1,4 +1,4 @@
-"""``pytest --hardware``: on the stand-ins, for want of metal."""
+"""``pytest --hardware``: with stand-ins in place of hardware."""
 
 from __future__ import annotations
 

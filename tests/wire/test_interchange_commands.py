@@ -1,4 +1,4 @@
-"""A loop of the small bench, recorded, and carried to AOT and to milk and back from the command line."""
+"""A recorded loop of the small bench, exported to AOT and milk and imported again on the command line."""
 
 from __future__ import annotations
 

@@ -1,12 +1,14 @@
-"""Real drivers on the simulated bench: what they measure is what the twin's own devices measure."""
+"""Real drivers on the simulated bench: the same measurements as with the twin's devices."""
 
 from __future__ import annotations
 
 import itertools
+import os
 import socket
 import struct
 import threading
 from collections.abc import Iterator
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -19,7 +21,7 @@ from escape_hw.config.loader import load_system
 from escape_hw.errors import DeviceError, DeviceLost
 from escape_hw.runtime.session.system import System
 from escape_sim.stand_ins import bench_server
-from escape_sim.stand_ins.bench_server import RequestKind, StandInBenchServer, stand_in_environment
+from escape_sim.stand_ins.bench_server import RequestKind, StandInBenchServer
 
 #: The region lies on the increments of the real camera; the screen of the real bench is moved by hand.
 JOINED = (
@@ -34,7 +36,10 @@ JOINED = (
 def server() -> Iterator[StandInBenchServer]:
     for name in ("asdk", "m3api", "aravis"):
         stand_in(name).clear(record=False)
-    with StandInBenchServer(load_system("razor-shwfs", overrides=JOINED)) as one, stand_in_environment(one):
+    with (
+        StandInBenchServer(load_system("razor-shwfs", overrides=JOINED)) as one,
+        patch.dict(os.environ, one.environment),
+    ):
         yield one
 
 

@@ -1,4 +1,4 @@
-"""The stand-in of libm3api by itself, and XIMEA's own wrapper on it."""
+"""The stand-in of libm3api alone, and with XIMEA's wrapper."""
 
 from __future__ import annotations
 
@@ -116,7 +116,7 @@ def test_offsets_keep_the_size_within_the_sensor(camera) -> None:
     assert camera.c.xiSetParamInt(camera.handle, b"width", 648) == 11
 
 
-def test_the_frame_rate_obeys_rows_exposure_and_mode(camera) -> None:
+def test_the_frame_rate_follows_rows_exposure_and_mode(camera) -> None:
     assert camera.c.xiSetParamFloat(camera.handle, b"framerate", c_float(100)) == 119, "free run"
     camera.set("acq_timing_mode", 1)
     camera.set("exposure", 100.0)
@@ -128,7 +128,7 @@ def test_the_frame_rate_obeys_rows_exposure_and_mode(camera) -> None:
     assert camera.get_float("framerate") == pytest.approx(1e6 / 10030)
 
 
-def test_faults_come_at_the_call_they_were_asked_for(xi, camera) -> None:
+def test_faults_come_at_the_requested_call(xi, camera) -> None:
     xi.script("xiGetImage 2 timeout 10; xiGetImage 3 error 13; xiGetImage 4 reset; xiGetImage 6 unplug 56")
     camera.set("exposure", 100.0)
     camera.start()

@@ -1,4 +1,4 @@
-"""Waves that make a circle: points, rates, corrections, and what is read off a recording."""
+"""Waves that make a circle: points, rates, corrections, and the analysis of a recording."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def test_phasors_are_found_from_any_beginning_and_length(begin, amplitude, phase
     assert middle == pytest.approx(mean, abs=1e-9)
 
 
-def test_less_than_a_turn_tells_nothing():
+def test_less_than_a_turn_gives_no_result():
     with pytest.raises(ValueError, match="less than a turn"):
         pi_circle.fit_phasors(np.zeros((10, 2)), 11.0)
 

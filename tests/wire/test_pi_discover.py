@@ -1,4 +1,4 @@
-"""A PI controller on the network is found by asking who it is, and left as it was."""
+"""A PI controller on the network is found by its identification, and not changed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Our files and devices with pyRTC itself: it reads what we write, and we read what it writes."""
+"""Files and devices of ESCAPE with pyRTC: each reads the files of the other."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Streams of pyRTC and of milk as cameras and mirrors: the contract, and what is their own."""
+"""Streams of pyRTC and of milk as cameras and mirrors: the contract, and their specific behaviour."""
 
 from __future__ import annotations
 
@@ -129,7 +129,7 @@ def test_what_does_not_fit_is_refused_by_name(kind: str, key: str) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_silent_stream_times_out_and_says_who_to_ask(kind: str) -> None:
+def test_a_silent_stream_times_out_and_states_who_to_ask(kind: str) -> None:
     name = f"{TAG}_silent"
     stream: Any = create(kind, name, SHAPE, "u2")
     try:

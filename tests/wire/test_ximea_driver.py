@@ -1,4 +1,4 @@
-"""What the XIMEA driver says to libm3api, call by call, and what it makes of every answer."""
+"""Calls of the XIMEA driver to libm3api, and its handling of every reply."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def test_every_call_of_a_session_in_order(xi) -> None:
     assert not xi.violations
 
 
-def test_a_stand_in_is_never_taken_for_metal(xi) -> None:
+def test_a_stand_in_is_never_taken_for_hardware(xi) -> None:
     with make("ximea") as camera:
         assert camera.info.simulated
         assert camera.info.model == "XIMEA MQ013MG-ON (stand-in)"
@@ -251,7 +251,7 @@ def test_the_wrong_downsampling_is_noticed(xi) -> None:
     assert xi.calls[-1] == "xiCloseDevice"
 
 
-def test_numbers_out_of_range_are_all_told_at_once() -> None:
+def test_numbers_out_of_range_are_all_reported_together() -> None:
     wrong = ("downsampling=0", "queue=1", "trigger_margin=0.9")
     with pytest.raises(ConfigError) as refused:
         make("ximea", *(f"devices.wfs.options.{one}" for one in wrong))
@@ -268,7 +268,7 @@ def test_one_camera_has_one_owner(xi) -> None:
         make("ximea").open()
 
 
-def test_a_camera_that_is_not_there_says_what_to_check(xi) -> None:
+def test_a_camera_that_is_not_there_states_what_to_check(xi) -> None:
     with pytest.raises(DeviceError, match=r"camera 'MQ_1' was not opened: error 56.*permissions"):
         make("ximea", "devices.wfs.serial=MQ_1").open()
 

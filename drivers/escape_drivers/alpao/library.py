@@ -10,8 +10,9 @@ import ctypes
 from ctypes import POINTER, c_char_p, c_double, c_int, c_size_t, c_uint32, c_void_p
 from typing import Any
 
-from escape_drivers.common.vendor_library import VendorLibrary, is_stand_in
-from escape_hw.errors import DeviceError, DeviceLost
+from escape_drivers.common.vendor_library import LoadedLibrary, Prototypes
+from escape_hw.api.discovery import VendorLibrary
+from escape_hw.errors import DeviceError
 
 _CONFIGURATION_HINT = "its configuration files (serial number .acfg and binary) must lie where ACECFG points"
 _CABLE_HINT = "check power, cable and the interface's address"
@@ -53,8 +54,6 @@ ERRORS: dict[int, tuple[str, str]] = {
     0x10D: ("no acknowledgement in time", f"{_CABLE_HINT}, or allow a longer ack_timeout_ms"),
     0x10E: ("no trigger in time", "check the trigger's cable, or set trigger_in to 'off'"),
 }
-#: Errors after which the mirror must be opened again.
-LOST_CODES = frozenset({0x101})
 
 
 def describe_error(number: int, text: str) -> str:
@@ -67,7 +66,7 @@ def describe_error(number: int, text: str) -> str:
 SDK = VendorLibrary(
     "ALPAO SDK", ("libasdk.so",), "ESCAPE_ALPAO_LIBRARY", "install the SDK that came with the mirror"
 )
-_PROTOTYPES: dict[str, tuple[Any, list[Any]]] = {
+_PROTOTYPES: Prototypes = {
     "asdkInit": (c_void_p, [c_char_p]),
     "asdkRelease": (c_int, [c_void_p]),
     "asdkSend": (c_int, [c_void_p, c_void_p]),
@@ -84,37 +83,17 @@ _MAX_STACKED_ERRORS = 64
 _TEXT_BYTES = 1024
 
 
-class AlpaoLibrary:
-    """The SDK, loaded; every method but :meth:`init` works on an ``asdkDM`` handle.
+class AlpaoLibrary(LoadedLibrary):
+    """The SDK, loaded; every method but :meth:`init` works on an ``asdkDM`` handle."""
 
-    Parameters
-    ----------
-    device
-        Name used in error messages.
-    path
-        Of the library; empty: the environment, then the default name.
-
-    Raises
-    ------
-    DeviceError
-        The library is missing or is another one.
-    """
-
-    def __init__(self, device: str, path: str = "") -> None:
-        self.device = device
-        self.c = SDK.bind(device, path, _PROTOTYPES)
-        self.stand_in = is_stand_in(self.c)
+    VENDOR, PROTOTYPES, LOST_CODES = SDK, _PROTOTYPES, frozenset({0x101})
 
     def init(self, serial: str) -> c_void_p:
         """Connect to the mirror of a serial number.
 
         A handle alone does not mean success: without a configuration the SDK may give one all the
-        same. So the error stack decides.
-
-        Raises
-        ------
-        DeviceError
-            It failed. What it gave is released, and never reset: the SDK may crash on that.
+        same. So the error stack decides. A handle given after an error is released, and never reset: the
+        SDK may crash on that.
         """
         stale = self._clear_errors()
         handle = self.c.asdkInit(serial.encode())
@@ -148,41 +127,22 @@ class AlpaoLibrary:
         error = self.last_error()
         if error is None:
             return DeviceError(self.device, f"{call} failed; the SDK gives no reason")
-        kind = DeviceLost if error[0] in LOST_CODES else DeviceError
-        return kind(self.device, f"{call} failed: {describe_error(*error)}")
+        return self._error(error[0], f"{call} failed: {describe_error(*error)}")
 
     def call(self, name: str, handle: c_void_p, *arguments: Any) -> None:
-        """Call a function that returns a ``COMPL_STAT``.
-
-        Raises
-        ------
-        DeviceLost, DeviceError
-            It failed.
-        """
+        """Call a function that returns a ``COMPL_STAT``."""
         if getattr(self.c, name)(handle, *arguments) != 0:
             raise self.error_for(name)
 
     def get(self, handle: c_void_p, name: str) -> float:
-        """Read a parameter.
-
-        Raises
-        ------
-        DeviceLost, DeviceError
-            It failed.
-        """
+        """Read a parameter."""
         value = c_double()
         if self.c.asdkGet(handle, name.encode(), ctypes.byref(value)) != 0:
             raise self.error_for(f"asdkGet({name})")
         return value.value
 
     def set(self, handle: c_void_p, name: str, value: float) -> None:
-        """Write a parameter.
-
-        Raises
-        ------
-        DeviceLost, DeviceError
-            It failed.
-        """
+        """Write a parameter."""
         if self.c.asdkSet(handle, name.encode(), value) != 0:
             raise self.error_for(f"asdkSet({name}, {value:g})")
 

@@ -6,16 +6,17 @@ import logging
 import os
 from collections.abc import Callable
 from ctypes import c_void_p
-from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from pydantic import Field
 
 from escape_drivers.alpao.library import AlpaoLibrary, format_version
-from escape_drivers.common.options import parse_options, require_in_range, require_serial
+from escape_drivers.common.options import parse_options, require_serial
 from escape_hw.api.mirror import DeformableMirror, DMInfo
+from escape_hw.config.section import Section
 from escape_hw.errors import CommandRejected, DeviceError
 
 if TYPE_CHECKING:
@@ -31,8 +32,7 @@ _TRIGGER_OUT = {"long": 0.0, "short": 1.0}
 _CONFIG_VARIABLE = "ACECFG"
 
 
-@dataclass(frozen=True, slots=True)
-class AlpaoOptions:
+class AlpaoOptions(Section):
     """The ``[devices.dm.options]`` of this driver; what is left at its default is not sent.
 
     Parameters
@@ -54,7 +54,7 @@ class AlpaoOptions:
     library: str = ""
     config_folder: str = ""
     sync: Literal["", "wait", "return"] = ""
-    ack_timeout_ms: int = 0
+    ack_timeout_ms: int = Field(0, ge=0, le=60_000)
     trigger_in: Literal["", "off", "rising", "falling"] = ""
     trigger_out: Literal["", "long", "short"] = ""
 
@@ -73,32 +73,15 @@ class AlpaoOptions:
 
 
 def make_mirror(name: str, config: SystemConfig, shared: dict[str, object]) -> AlpaoMirror:
-    """Entry point ``alpao``.
-
-    Raises
-    ------
-    ConfigError
-        The serial number is missing, or an option is unknown.
-    """
+    """Entry point ``alpao``; raises ``ConfigError`` if the serial number is missing or an option is wrong."""
     section = config.devices.dm
     require_serial(name, section)
     options = parse_options(AlpaoOptions, name, section)
-    require_in_range(name, options, {"ack_timeout_ms": (0, 60_000)})
     return AlpaoMirror(name, section, options)
 
 
 class AlpaoMirror(DeformableMirror):
-    """An ALPAO mirror. Closing ramps to flat, stops, resets and releases it, in this order.
-
-    Parameters
-    ----------
-    name
-        Key in ``[devices]``.
-    section
-        Geometry, serial number and limits.
-    options
-        Of this driver.
-    """
+    """An ALPAO mirror. Closing ramps to flat, stops, resets and releases it, in this order."""
 
     def __init__(self, name: str, section: MirrorConfig, options: AlpaoOptions) -> None:
         super().__init__(name, section.limits.to_limits())
@@ -118,19 +101,8 @@ class AlpaoMirror(DeformableMirror):
         return self._info
 
     @property
-    def is_playing(self) -> bool:
-        """True after :meth:`play_patterns`, until the next command or :meth:`stop_pattern`."""
-        return self._playing
-
-    @property
     def handle(self) -> c_void_p:
-        """The SDK's handle, for calls that this driver does not make.
-
-        Raises
-        ------
-        NotOpen
-            The mirror is not connected.
-        """
+        """The SDK's handle, for calls that this driver does not make; raises ``NotOpen`` when closed."""
         self.require_open()
         return self._require_connected()[1]
 
@@ -167,29 +139,10 @@ class AlpaoMirror(DeformableMirror):
             self._shape_known = False
 
     def stop_pattern(self) -> None:
-        """Stop a sequence; the mirror keeps the shape it has. Does nothing when none runs.
-
-        Raises
-        ------
-        NotOpen, DeviceError
-            The mirror is not connected, or did not stop.
-        """
+        """Stop a sequence; the mirror keeps the shape it has. Does nothing when none runs."""
         with self._lock:
             self._guard_when_open()
             self._stop_playing()
-
-    def parameter(self, name: str) -> float:
-        """Read a parameter of the SDK, such as ``"ItfState"``.
-
-        Raises
-        ------
-        NotOpen, DeviceError
-            The mirror is not connected, or the parameter does not exist.
-        """
-        with self._lock:
-            self.require_open()
-            library, handle = self._require_connected()
-            return library.get(handle, name)
 
     def _open(self) -> None:
         if self._options.config_folder:

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import ctypes
 import logging
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from escape_drivers.aravis.library import AravisLibrary, ReceivedBuffer
 from escape_drivers.common.camera import BlockingCamera
 from escape_drivers.common.camera_limits import CameraLimits, ParameterRange
-from escape_drivers.common.options import camera_section, parse_options, require_in_range, require_serial
+from escape_drivers.common.options import camera_section, parse_options, require_serial
 from escape_hw.api.camera import CameraSettings, Frame, Region
-from escape_hw.errors import DeviceError, DeviceLost, NotOpen
+from escape_hw.config.section import Section
+from escape_hw.errors import DeviceError, DeviceLost
 
 if TYPE_CHECKING:
     from escape_hw.config.devices import CameraConfig
@@ -36,8 +37,7 @@ _RATE_SWITCHES = ("AcquisitionFrameRateEnable", "AcquisitionFrameRateEnabled")
 _AUTO_FEATURES = ("ExposureAuto", "GainAuto", "AcquisitionFrameRateAuto")
 
 
-@dataclass(frozen=True, slots=True)
-class AravisOptions:
+class AravisOptions(Section):
     """The ``[devices.science.options]`` of this driver.
 
     Parameters
@@ -59,43 +59,24 @@ class AravisOptions:
     library: str = ""
     interface: Literal["", "Fake"] = ""
     pixel_format: Literal["Mono16", "Mono14", "Mono12", "Mono10", "Mono8"] = "Mono16"
-    shift: int = 0
-    buffers: int = 8
+    shift: int = Field(0, ge=0, le=8)
+    buffers: int = Field(8, ge=2, le=64)
     newest: bool = False
 
 
 def make_camera(name: str, config: SystemConfig, shared: dict[str, object]) -> AravisCamera:
-    """Entry point ``aravis``.
-
-    Raises
-    ------
-    ConfigError
-        The camera or its serial number is missing, or an option is unknown.
-    """
+    """Entry point ``aravis``; raises ``ConfigError`` if the serial number is missing or an option wrong."""
     section = camera_section(name, config)
     require_serial(name, section)
-    options = parse_options(AravisOptions, name, section)
-    require_in_range(name, options, {"shift": (0, 8), "buffers": (2, 64)})
-    return AravisCamera(name, section, options)
+    return AravisCamera(name, section, parse_options(AravisOptions, name, section))
 
 
-class AravisCamera(BlockingCamera):
-    """A GenICam camera.
-
-    Parameters
-    ----------
-    name
-        Key in ``[devices]``.
-    section
-        Serial number, sensor, region, exposure and rate to begin with.
-    options
-        Of this driver.
-    """
+class AravisCamera(BlockingCamera[AravisLibrary]):
+    """A GenICam camera."""
 
     def __init__(self, name: str, section: CameraConfig, options: AravisOptions) -> None:
         super().__init__(name, section, "GenICam camera", _BLOCK_ID_RANGE)
         self._options = options
-        self._library: AravisLibrary | None = None
         self._incomplete = 0
 
     @property
@@ -104,7 +85,7 @@ class AravisCamera(BlockingCamera):
         return self._incomplete
 
     def _open(self) -> None:
-        library = self._library = AravisLibrary(self.name, self._options.library)
+        library = self._connection = AravisLibrary(self.name, self._options.library)
         library.open(self._section.serial.strip(), self._options.interface)
         model = (library.call("camera_get_model_name") or b"GenICam camera").decode(errors="replace")
         library.call("camera_set_pixel_format_from_string", self._options.pixel_format.encode())
@@ -121,11 +102,6 @@ class AravisCamera(BlockingCamera):
         self._info = self._build_info(model, library.stand_in or self._options.interface == "Fake")
         log.info("%s: %s, serial number %s", self.name, model, self._section.serial)
         self._settings = self._apply_settings(self._check(self._section.settings()))
-
-    def _disconnect(self) -> None:
-        library, self._library = self._library, None
-        if library is not None:
-            library.close()
 
     def _apply_settings(self, want: CameraSettings) -> CameraSettings:
         library, limits, region = self._require_connected(), self._require_limits(), want.region
@@ -222,11 +198,6 @@ class AravisCamera(BlockingCamera):
             np.uint16, copy=False
         )
         return np.right_shift(counts, np.uint16(self._options.shift)) if self._options.shift else counts
-
-    def _require_connected(self) -> AravisLibrary:
-        if self._library is None:
-            raise NotOpen(self.name, "is not connected; call open() first")
-        return self._library
 
 
 def _read_limits(library: AravisLibrary) -> CameraLimits:

@@ -10,7 +10,8 @@ from collections.abc import Sequence
 from ctypes import POINTER, byref, c_char_p, c_double, c_int, c_size_t, c_uint, c_uint64, c_void_p
 from typing import Any, NamedTuple
 
-from escape_drivers.common.vendor_library import VendorLibrary, is_stand_in
+from escape_drivers.common.vendor_library import LoadedLibrary, Prototypes
+from escape_hw.api.discovery import VendorLibrary
 from escape_hw.errors import DeviceError
 
 ARAVIS = VendorLibrary(
@@ -27,7 +28,7 @@ class _GError(ctypes.Structure):
 
 _ERROR = POINTER(POINTER(_GError))
 _INT, _REAL = POINTER(c_int), POINTER(c_double)
-_PROTOTYPES: dict[str, tuple[Any, list[Any]]] = {
+_PROTOTYPES: Prototypes = {
     "arv_enable_interface": (None, [c_char_p]),
     "arv_update_device_list": (None, []),
     "arv_get_n_devices": (c_uint, []),
@@ -88,44 +89,18 @@ class ReceivedBuffer(NamedTuple):
     height: int
 
 
-class AravisLibrary:
-    """The library, loaded, with one camera and at most one stream.
+class AravisLibrary(LoadedLibrary):
+    """The library, loaded, with one camera and at most one stream."""
 
-    Parameters
-    ----------
-    device
-        Name used in error messages.
-    path
-        Of the library; empty: the environment, then the default names.
-
-    Raises
-    ------
-    DeviceError
-        The library is missing or is another one.
-    """
+    VENDOR, PROTOTYPES = ARAVIS, _PROTOTYPES
 
     def __init__(self, device: str, path: str = "") -> None:
-        self.device = device
-        self.c = ARAVIS.bind(device, path, _PROTOTYPES)
-        self.stand_in = is_stand_in(self.c)
+        super().__init__(device, path)
         self.camera: c_void_p | None = None
         self._stream: c_void_p | None = None
 
     def open(self, serial: str, interface: str = "") -> None:
-        """Connect to the camera of a serial number.
-
-        Parameters
-        ----------
-        serial
-            As the camera reports it.
-        interface
-            An interface to switch on first, such as Aravis's own ``"Fake"``.
-
-        Raises
-        ------
-        DeviceError
-            There is none, or another process has it.
-        """
+        """Connect to the camera of a serial number, after enabling an interface (Aravis's own ``"Fake"``)."""
         if interface:
             self.c.arv_enable_interface(interface.encode())
         self.c.arv_update_device_list()
@@ -149,13 +124,7 @@ class AravisLibrary:
             self.c.g_object_unref(camera)
 
     def call(self, name: str, *arguments: Any, with_camera: bool = True) -> Any:
-        """Call ``arv_NAME`` with this camera first, if ``with_camera``, and an error pointer last.
-
-        Raises
-        ------
-        DeviceError
-            The camera or Aravis refused; with Aravis's own words.
-        """
+        """Call ``arv_NAME`` with this camera first, if ``with_camera``, and an error pointer last."""
         error = POINTER(_GError)()
         first = (self.camera,) if with_camera else ()
         result = getattr(self.c, f"arv_{name}")(*first, *arguments, byref(error))
@@ -185,13 +154,7 @@ class AravisLibrary:
         return None
 
     def start_stream(self, n_buffers: int) -> None:
-        """Make a stream with its buffers, and start acquisition.
-
-        Raises
-        ------
-        DeviceError
-            It failed.
-        """
+        """Make a stream with its buffers, and start acquisition."""
         payload = self.call("camera_get_payload")
         self._stream = c_void_p(self.call("camera_create_stream", None, None))
         if not self._stream:
@@ -212,10 +175,10 @@ class AravisLibrary:
     def pop_buffer(self, wait_ms: int) -> int | None:
         """A buffer from the stream, or ``None`` when there is none in time."""
         if wait_ms == 0:
-            buffer_info = self.c.arv_stream_try_pop_buffer(self._stream)
+            buffer: int | None = self.c.arv_stream_try_pop_buffer(self._stream)
         else:
-            buffer_info = self.c.arv_stream_timeout_pop_buffer(self._stream, wait_ms * 1000)
-        return None if buffer_info is None else int(buffer_info)
+            buffer = self.c.arv_stream_timeout_pop_buffer(self._stream, wait_ms * 1000)
+        return buffer
 
     def push_buffer(self, buffer: int) -> None:
         """Give a buffer back to the stream."""

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,6 +42,7 @@ _ACK_FIELDS = struct.Struct("<IHBBHxxQQ")
 _NAK_FIELDS = struct.Struct("<IHBx")
 _HEALTH_FIELDS = struct.Struct("<IBxxxQffffffIII")
 _TELEM_FIELDS = struct.Struct("<IBxHQ")
+_DONE_FIELDS, _PARAM_FIELDS = struct.Struct("<IB"), struct.Struct("<Id")
 _HOLDING, _SIMULATED = 1, 1
 #: A shape counted from the mirror's flat one, as all of ours are.
 _RELATIVE_TO_FLAT = 1
@@ -59,13 +61,7 @@ class AsmCodec:
 
     # ------------------------------------------------------------------ out
     def request(self, sequence: int, time_ns: int, message: m.Request) -> bytes:
-        """The bytes of a request.
-
-        Raises
-        ------
-        ValueError
-            A text or a list is too long.
-        """
+        """The bytes of a request; raises ``ValueError`` if a text or a list is too long."""
         kind, payload = _encode_request(message)
         return encode_frame(kind, sequence, time_ns, payload)
 
@@ -115,13 +111,7 @@ class AsmCodec:
 
 
 def encode_frame(kind: int, sequence: int, time_ns: int, payload: bytes) -> bytes:
-    """A frame around a payload.
-
-    Raises
-    ------
-    ValueError
-        The payload is larger than the protocol allows.
-    """
+    """A frame around a payload; raises ``ValueError`` if it is larger than the protocol allows."""
     if len(payload) > MAX_PAYLOAD_BYTES:
         raise ValueError(f"{len(payload)} bytes are more than the {MAX_PAYLOAD_BYTES} that a frame may have")
     head = _HEADER.pack(MAGIC, VERSIONS[1], kind, 0, sequence, len(payload), time_ns)
@@ -129,13 +119,7 @@ def encode_frame(kind: int, sequence: int, time_ns: int, payload: bytes) -> byte
 
 
 def _parse_frame(buffer: bytearray) -> tuple[int, bytes, int] | None:
-    """Type, payload and size of the first frame if it is whole.
-
-    Raises
-    ------
-    ProtocolError
-        The bytes received cannot become a frame; raised at the first wrong byte.
-    """
+    """Type, payload and size of the first frame if it is whole; ``ProtocolError`` at the first wrong byte."""
     if not MAGIC.startswith(buffer[: len(MAGIC)]):
         raise m.ProtocolError(f"a frame begins with {bytes(buffer[:4])!r}, not {MAGIC!r}")
     if len(buffer) < HEADER_BYTES:
@@ -211,6 +195,9 @@ class _PayloadReader:
         self.offset += count
         return self.payload[self.offset - count : self.offset]
 
+    def unpack(self, fields: struct.Struct) -> tuple[Any, ...]:
+        return fields.unpack(self.read_bytes(fields.size))
+
     def read_counted(self) -> bytes:
         (count,) = struct.unpack("<H", self.read_bytes(2))
         return self.read_bytes(count)
@@ -230,85 +217,49 @@ class _PayloadReader:
             raise ValueError(f"{len(self.payload) - self.offset} bytes of payload are too many")
 
 
-def _decode_welcome(read: _PayloadReader) -> m.Welcome:
-    echo, version, _, state, flags, n_act, token, command, step, hold, rest = _WELCOME_FIELDS.unpack(
-        read.read_bytes(_WELCOME_FIELDS.size)
-    )
-    serial, disabled, last_command_m = read.text(), read.indices(), read.read_floats(n_act)
-    return m.Welcome(
-        echo, version, token, serial, bool(flags & _SIMULATED), _STATES[state], command, step, hold, rest,
-        disabled, last_command_m,
-    )  # fmt: skip
-
-
-def _decode_ack(read: _PayloadReader) -> m.Ack:
-    echo, result, state, flags, clipped, received, applied = _ACK_FIELDS.unpack(
-        read.read_bytes(_ACK_FIELDS.size)
-    )
-    count = (len(read.payload) - read.offset) // 4
-    return m.Ack(
-        echo, m.Result(result), _STATES[state], clipped, bool(flags & _HOLDING), received, applied,
-        read.read_floats(count),
-    )  # fmt: skip
-
-
-def _decode_nak(read: _PayloadReader) -> m.Nak:
-    echo, code, state = _NAK_FIELDS.unpack(read.read_bytes(_NAK_FIELDS.size))
-    return m.Nak(echo, m.Result(code), _STATES[state], read.text())
-
-
-def _decode_done(read: _PayloadReader) -> m.Done:
-    echo, state = struct.unpack("<IB", read.read_bytes(5))
-    return m.Done(echo, _STATES[state], read.text())
-
-
-def _decode_health(read: _PayloadReader) -> m.HealthReport:
-    echo, state, time_ns, gap, current, warmest, coolant, humidity, dew, applied, skipped, crc_errors = (
-        _HEALTH_FIELDS.unpack(read.read_bytes(_HEALTH_FIELDS.size))
-    )
-    contaminated, owner, fault = read.indices(), read.text(), read.text()
-    return m.HealthReport(
-        echo, _STATES[state], time_ns, gap, current, warmest, coolant, humidity, dew, applied, skipped,
-        crc_errors,
-        contaminated, owner, fault,
-    )  # fmt: skip
-
-
-def _decode_param(read: _PayloadReader) -> m.Param:
-    echo, value = struct.unpack("<Id", read.read_bytes(12))
-    return m.Param(echo, read.text(), value)
-
-
-def _decode_telemetry(read: _PayloadReader) -> m.TelemetrySample:
-    counter, state, n_act, time_ns = _TELEM_FIELDS.unpack(read.read_bytes(_TELEM_FIELDS.size))
-    command, position, current = (read.read_floats(n_act) for _ in range(3))
-    flags = np.frombuffer(read.read_bytes(n_act), np.uint8)
-    return m.TelemetrySample(counter, _STATES[state], time_ns, command, position, current, flags)
-
-
-def _decode_fault(read: _PayloadReader) -> m.FaultReport:
-    (state,) = read.read_bytes(1)
-    return m.FaultReport(_STATES[state], read.text())
-
-
-_READERS: dict[int, Callable[[_PayloadReader], m.Reply]] = {
-    _WELCOME: _decode_welcome,
-    _ACK: _decode_ack,
-    _NAK: _decode_nak,
-    _DONE: _decode_done,
-    _HEALTH: _decode_health,
-    _PARAM: _decode_param,
-    _TELEM: _decode_telemetry,
-    _FAULT: _decode_fault,
-}
-
-
 def _decode_reply(kind: int, payload: bytes) -> m.Reply:
     """The reply in a payload."""
-    reader = _READERS.get(kind)
-    if reader is None:
-        raise ValueError(f"type {kind} is unknown")
-    cursor = _PayloadReader(payload)
-    reply = reader(cursor)
-    cursor.end()
+    read = _PayloadReader(payload)
+    reply = _read_reply(kind, read)
+    read.end()
     return reply
+
+
+def _read_reply(kind: int, read: _PayloadReader) -> m.Reply:
+    if kind == _WELCOME:
+        echo, version, _, state, flags, n_act, token, command, step, hold, rest = read.unpack(_WELCOME_FIELDS)
+        return m.Welcome(
+            echo, version, token, read.text(), bool(flags & _SIMULATED), _STATES[state], command, step, hold,
+            rest, read.indices(), read.read_floats(n_act),
+        )  # fmt: skip
+    if kind == _ACK:
+        echo, result, state, flags, clipped, received, applied = read.unpack(_ACK_FIELDS)
+        positions = read.read_floats((len(read.payload) - read.offset) // 4)
+        holding = bool(flags & _HOLDING)
+        return m.Ack(echo, m.Result(result), _STATES[state], clipped, holding, received, applied, positions)
+    if kind == _NAK:
+        echo, code, state = read.unpack(_NAK_FIELDS)
+        return m.Nak(echo, m.Result(code), _STATES[state], read.text())
+    if kind == _DONE:
+        echo, state = read.unpack(_DONE_FIELDS)
+        return m.Done(echo, _STATES[state], read.text())
+    if kind == _HEALTH:
+        (
+            echo, state, time_ns, gap, current, warmest, coolant, humidity, dew, applied, skipped, crc_errors,
+        ) = read.unpack(_HEALTH_FIELDS)  # fmt: skip
+        return m.HealthReport(
+            echo, _STATES[state], time_ns, gap, current, warmest, coolant, humidity, dew, applied, skipped,
+            crc_errors, read.indices(), read.text(), read.text(),
+        )  # fmt: skip
+    if kind == _PARAM:
+        echo, value = read.unpack(_PARAM_FIELDS)
+        return m.Param(echo, read.text(), value)
+    if kind == _TELEM:
+        counter, state, n_act, time_ns = read.unpack(_TELEM_FIELDS)
+        command, position, current = (read.read_floats(n_act) for _ in range(3))
+        flag_bytes = np.frombuffer(read.read_bytes(n_act), np.uint8)
+        return m.TelemetrySample(counter, _STATES[state], time_ns, command, position, current, flag_bytes)
+    if kind == _FAULT:
+        (state,) = read.read_bytes(1)
+        return m.FaultReport(_STATES[state], read.text())
+    raise ValueError(f"type {kind} is unknown")

@@ -26,13 +26,7 @@ R = TypeVar("R", bound=m.Welcome | m.Ack | m.Done | m.Param | m.HealthReport)
 
 
 class MirrorRefusal(DeviceError):
-    """The mirror refused a request, and nothing of it was done.
-
-    Attributes
-    ----------
-    nak
-        Text of the refusal.
-    """
+    """The mirror refused a request, and nothing of it was done; ``nak`` is its reply."""
 
     def __init__(self, device: str, nak: m.Nak) -> None:
         super().__init__(device, f"refused ({nak.code.name.lower().replace('_', ' ')}): {nak.text}")
@@ -44,21 +38,8 @@ class AsmLink:
 
     An exchange ends with its answer or it ends the connection: after a time-out it is impossible to tell a
     late answer from the next one. Nothing is ever sent twice. Not thread-safe; the driver has a lock.
-
-    Parameters
-    ----------
-    name
-        The device's, for messages.
-    address
-        Host and port.
-    role
-        What the connection is for.
-    make_codec
-        Makes the codec of a new connection.
-    connect_s, reply_s
-        Longest wait for a connection and for an answer, in seconds.
-    unasked
-        Called with messages that answer nothing.
+    Every exchange raises :class:`DeviceLost` when the connection breaks or no answer comes; the connection is
+    closed then. ``on_unsolicited`` is called with messages that answer nothing.
     """
 
     def __init__(
@@ -94,10 +75,8 @@ class AsmLink:
 
         Raises
         ------
-        Refused
+        MirrorRefusal
             The mirror has an owner already, or speaks no version of ours.
-        DeviceLost
-            The host does not answer.
         """
         self.disconnect("it is being connected anew")
         host, port = self.address
@@ -120,26 +99,12 @@ class AsmLink:
         return welcome
 
     def request(self, message: m.Request, answer: type[R]) -> R:
-        """Send a request and wait for its answer.
-
-        Raises
-        ------
-        Refused
-            The mirror refused it.
-        DeviceLost
-            No answer, or the connection broke; it is closed now.
-        """
+        """Send a request and wait for its answer; raises :class:`MirrorRefusal` if it is refused."""
         sequence = self._next_sequence()
         return self._exchange(self._codec.request(sequence, time.monotonic_ns(), message), answer)
 
     def command(self, metres: NDArray[np.float64]) -> m.Ack:
-        """Send a shape ``(n_act,)`` in metres from flat and wait for its acknowledgement.
-
-        Raises
-        ------
-        Refused, DeviceLost
-            As for :meth:`request`.
-        """
+        """Send a shape ``(n_act,)`` in metres from flat and wait for its acknowledgement."""
         self._counter = self._counter % _MAX_SEQUENCE + 1
         data = self._codec.command(self._next_sequence(), time.monotonic_ns(), self._counter, metres)
         return self._exchange(data, m.Ack)
@@ -150,13 +115,7 @@ class AsmLink:
         return self._sequence
 
     def receive(self, timeout_s: float) -> list[m.Reply]:
-        """Unsolicited messages received within a time; messages that arrive together are returned together.
-
-        Raises
-        ------
-        DeviceLost
-            The connection broke; it is closed now.
-        """
+        """Unsolicited messages received within a time, with those that arrive together."""
         try:
             return self._read(time.monotonic() + timeout_s)
         except TimeoutError:
@@ -220,15 +179,7 @@ class AsmLink:
         return answer
 
     def _read(self, deadline: float) -> list[m.Reply]:
-        """Replies received before a deadline; at least one.
-
-        Raises
-        ------
-        TimeoutError
-            None came.
-        DeviceLost
-            The connection broke; it is closed now.
-        """
+        """Replies received before a deadline; raises ``TimeoutError`` if none came."""
         while True:
             if self._socket is None:
                 raise self.connection_lost_error()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import threading
 import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING
@@ -15,13 +14,14 @@ from escape_drivers.asm import messages as m
 from escape_drivers.asm.codec import AsmCodec
 from escape_drivers.asm.link import AsmLink, MirrorRefusal
 from escape_drivers.asm.messages import Welcome
-from escape_drivers.asm.options import EMULATOR, OPTION_RANGES, AsmOptions
-from escape_drivers.common.options import parse_options, require_in_range, require_serial
+from escape_drivers.asm.options import EMULATOR, AsmOptions
+from escape_drivers.common.options import parse_options, require_serial
 from escape_hw.api.adaptive_secondary import AdaptiveSecondary, ShellHealth, ShellState
 from escape_hw.api.emulator import Emulator, EmulatorRequest
 from escape_hw.api.mirror import DMInfo
 from escape_hw.config.registry import emulator_factory
 from escape_hw.errors import DeviceError, SettingRejected
+from escape_hw.supervision import BackgroundThread
 
 if TYPE_CHECKING:
     from escape_hw.config.devices import MirrorConfig
@@ -33,13 +33,7 @@ _ROUNDING = 1e-6
 
 
 def require_identity(name: str, section: MirrorConfig, welcome: Welcome) -> None:
-    """Require the expected mirror; an observer needs no further checks.
-
-    Raises
-    ------
-    DeviceError
-        It is another mirror.
-    """
+    """Require the expected mirror; an observer needs no further checks."""
     if welcome.last_command_m.size != section.n_act:
         raise DeviceError(
             name,
@@ -56,15 +50,6 @@ def require_identity(name: str, section: MirrorConfig, welcome: Welcome) -> None
 def require_compatible(name: str, section: MirrorConfig, welcome: Welcome) -> tuple[int, ...]:
     """Require the mirror that was meant, and limits of ours that lie within its own.
 
-    Parameters
-    ----------
-    name
-        The device's.
-    section
-        Its configuration.
-    welcome
-        Welcome message of the mirror.
-
     Returns
     -------
     tuple of int
@@ -72,8 +57,6 @@ def require_compatible(name: str, section: MirrorConfig, welcome: Welcome) -> tu
 
     Raises
     ------
-    DeviceError
-        It is another mirror.
     SettingRejected
         A limit of ours exceeds the mirror's, or actuators are out of service that the configuration
         counts on.
@@ -109,17 +92,10 @@ _STEP_POLL_S = 0.02
 
 
 def make_asm(name: str, config: SystemConfig, shared: dict[str, object]) -> AsmMirror:
-    """Entry point ``asm``.
-
-    Raises
-    ------
-    ConfigError
-        No serial number, or an option is wrong.
-    """
+    """Entry point ``asm``; raises ``ConfigError`` if the serial number is missing or an option is wrong."""
     section = config.devices.dm
     require_serial(name, section)
     options = parse_options(AsmOptions, name, section)
-    require_in_range(name, options, OPTION_RANGES)
     emulator = None
     if options.host == EMULATOR:
         emulator = emulator_factory("asm")(EmulatorRequest(port=0, shared=shared, config=config))
@@ -136,12 +112,6 @@ class AsmMirror(AdaptiveSecondary):
 
     Parameters
     ----------
-    name
-        Of the device.
-    section
-        Geometry, limits and serial number.
-    options
-        Of the link.
     make_codec
         Makes the codec of a connection; the observatory's own goes here.
     emulator
@@ -163,8 +133,7 @@ class AsmMirror(AdaptiveSecondary):
         self._link = self._make_link(m.Role.CONTROL)
         self._info = section.info("adaptive secondary over TCP", simulated=False)
         self._metres = np.empty(section.n_act)
-        self._stop = threading.Event()
-        self._heartbeat_thread: threading.Thread | None = None
+        self._heartbeat: BackgroundThread | None = None
         self._ack: m.Ack | None = None
         self._last_state, self._fault_text = ShellState.OFF, ""
         self._initial_shape: NDArray[np.float64] | None = None
@@ -178,29 +147,12 @@ class AsmMirror(AdaptiveSecondary):
         """Identity and geometry."""
         return self._info
 
-    @property
-    def last_ack(self) -> m.Ack | None:
-        """The last acknowledgement: result, times on the mirror's clock, measured positions in metres."""
-        return self._ack
-
     def parameter(self, key: str) -> float:
-        """One of the mirror's own parameters, such as ``telemetry_hz``.
-
-        Raises
-        ------
-        NotOpen, DeviceError
-            Not connected, or the parameter does not exist.
-        """
+        """One of the mirror's own parameters, such as ``telemetry_hz``; ``DeviceError`` if it has none."""
         return self._parameter(m.GetParam(key))
 
     def set_parameter(self, key: str, value: float) -> float:
-        """Set one of the mirror's own parameters; returns the value in force.
-
-        Raises
-        ------
-        NotOpen, DeviceError
-            Not connected, or the mirror refused the name or the value.
-        """
+        """Set one of the mirror's own parameters; returns the value in force, ``DeviceError`` if refused."""
         return self._parameter(m.SetParam(key, value))
 
     def _parameter(self, request: m.GetParam | m.SetParam) -> float:
@@ -219,11 +171,9 @@ class AsmMirror(AdaptiveSecondary):
     def _open(self) -> None:
         self._link.address = self._start_address()
         self._apply_welcome(self._link.connect())
-        self._stop.clear()
-        self._heartbeat_thread = threading.Thread(
-            target=self._run_heartbeat, name=f"{self.name} heartbeat", daemon=True
-        )
-        self._heartbeat_thread.start()
+        period_s = self._options.heartbeat_s / 4
+        self._heartbeat = BackgroundThread(f"{self.name} heartbeat", self._send_heartbeat_if_due, period_s)
+        self._heartbeat.start()
 
     def _apply_welcome(self, welcome: m.Welcome) -> None:
         """Adopt identity and state of the mirror at the beginning of a connection."""
@@ -242,10 +192,10 @@ class AsmMirror(AdaptiveSecondary):
         self._info = self._section.info(model, simulated=welcome.simulated, serial=welcome.serial)
 
     def _close(self) -> None:
-        self._stop.set()
-        if self._heartbeat_thread is not None:
-            self._heartbeat_thread.join()
-            self._heartbeat_thread = None
+        if self._heartbeat is not None:
+            # A heartbeat in progress ends with its answer or its time-out.
+            self._heartbeat.stop(self._options.connect_s + 2 * self._options.reply_s)
+            self._heartbeat = None
         self._link.disconnect("it was closed")
         if self._emulator is not None:
             self._emulator.stop()
@@ -257,24 +207,22 @@ class AsmMirror(AdaptiveSecondary):
         return self._initial_shape
 
     # ------------------------------------------------------------------ signs of life
-    def _run_heartbeat(self) -> None:
-        """Send heartbeats when nothing else was sent for a while; restore a lost link."""
-        pause = self._options.heartbeat_s
-        while not self._stop.wait(pause / 4):
-            if self._link.is_up and time.monotonic() - self._link.last_reply_s < pause:
-                continue
-            # A thread that holds the lock is exchanging messages, which also resets the watchdog.
-            if self._lock.acquire(blocking=False):
-                try:
-                    self._send_heartbeat()
-                finally:
-                    self._lock.release()
+    def _send_heartbeat_if_due(self) -> None:
+        """Send a heartbeat when nothing else was sent for a while; restore a lost link."""
+        if self._link.is_up and time.monotonic() - self._link.last_reply_s < self._options.heartbeat_s:
+            return
+        # A thread that holds the lock is exchanging messages, which also resets the watchdog.
+        if self._lock.acquire(blocking=False):
+            try:
+                self._send_heartbeat()
+            finally:
+                self._lock.release()
 
     def _send_heartbeat(self) -> None:
         before = self._last_state
         try:
             if self._link.is_up:
-                self._ask_state()
+                self._state()
             elif self.is_open and time.monotonic() > self._retry_at_s():
                 self._reconnect()
         except DeviceError as error:
@@ -287,11 +235,8 @@ class AsmMirror(AdaptiveSecondary):
             if self._last_state is not before:
                 log.warning(
                     "%s: changed from %s to %s without a command %s",
-                    self.name,
-                    before,
-                    self._last_state,
-                    self._fault_text,
-                )
+                    self.name, before, self._last_state, self._fault_text,
+                )  # fmt: skip
 
     def _retry_at_s(self) -> float:
         """When a lost connection is tried again, on this computer's monotonic clock."""
@@ -318,7 +263,7 @@ class AsmMirror(AdaptiveSecondary):
             log.error("%s: fault: %s", self.name, message.text)
 
     # ------------------------------------------------------------------ questions
-    def _ask_state(self) -> ShellState:
+    def _state(self) -> ShellState:
         with self._lock:
             return self._record_ack(self._link.request(m.Heartbeat(), m.Ack))
 
@@ -329,9 +274,6 @@ class AsmMirror(AdaptiveSecondary):
             )
         self._ack, self._last_state = ack, ack.state
         return ack.state
-
-    def _state(self) -> ShellState:
-        return self._ask_state()
 
     def _known_state(self) -> ShellState:
         return self._last_state
@@ -372,7 +314,7 @@ class AsmMirror(AdaptiveSecondary):
             self._consecutive_skips = 0
         self._link.request(m.SetState(state), m.Done)
         deadline = time.monotonic() + self._options.step_s
-        while (now := self._ask_state()) is not state and now is not ShellState.FAULT:
+        while (now := self._state()) is not state and now is not ShellState.FAULT:
             if time.monotonic() > deadline:
                 raise DeviceError(
                     self.name, f"is {now} and not {state} after {self._options.step_s:g} s; see its health"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from types import TracebackType
 from typing import Self
 
 from escape_drivers.asm import messages as m
@@ -17,18 +16,8 @@ from escape_hw.errors import FrameTimeout
 class AsmObserver:
     """A connection that receives the mirror's telemetry, health and faults; a context manager.
 
-    Any number of observers may connect. A slow observer gets the newest sample.
-
-    Parameters
-    ----------
-    name
-        For messages.
-    host, port
-        Where the mirror's gateway listens.
-    patience_s
-        Longest wait for a connection, seconds.
-    make_codec
-        Makes the codec of a connection.
+    Any number of observers may connect. A slow observer gets the newest sample. ``connect_timeout_s`` is the
+    longest wait for a connection and for an answer.
 
     Attributes
     ----------
@@ -55,20 +44,11 @@ class AsmObserver:
         )  # fmt: skip
 
     def __enter__(self) -> Self:
-        """Connect.
-
-        Raises
-        ------
-        DeviceError
-            The host does not answer, or the mirror refuses.
-        """
+        """Connect; raises ``DeviceError`` if the host does not answer or the mirror refuses."""
         self._link.connect()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Disconnect."""
+    def __exit__(self, *exception: object) -> None:
         self._link.disconnect("it was closed")
 
     def sample(self, timeout_s: float = 1.0) -> m.TelemetrySample:

@@ -2,27 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import Annotated
+
+from pydantic import Field
+
+from escape_hw.config.section import Section
 
 #: Default port of ``escape emulate asm``.
 DEFAULT_PORT = 7336
 #: Host name of an emulator inside this process with the twin's actuators.
 EMULATOR = "emulator"
 
-#: Smallest and largest value of each number.
-OPTION_RANGES = {
-    "port": (1, 65535),
-    "connect_s": (1e-3, 600),
-    "reply_s": (1e-3, 600),
-    "heartbeat_s": (1e-3, 600),
-    "step_s": (1e-3, 600),
-    "retry_s": (1e-3, 600),
-    "max_skips": (1, 1e6),
-}
+#: A duration in seconds.
+Seconds = Annotated[float, Field(ge=1e-3, le=600)]
 
 
-@dataclass(frozen=True, slots=True)
-class AsmOptions:
+class AsmOptions(Section):
     """Options of the link; times in seconds.
 
     Parameters
@@ -45,11 +40,11 @@ class AsmOptions:
     """
 
     host: str = "127.0.0.1"
-    port: int = DEFAULT_PORT
+    port: int = Field(DEFAULT_PORT, ge=1, le=65535)
     lift: bool = True
-    connect_s: float = 2.0
-    reply_s: float = 0.5
-    heartbeat_s: float = 0.1
-    step_s: float = 60.0
-    retry_s: float = 0.25
-    max_skips: int = 10
+    connect_s: Seconds = 2.0
+    reply_s: Seconds = 0.5
+    heartbeat_s: Seconds = 0.1
+    step_s: Seconds = 60.0
+    retry_s: Seconds = 0.25
+    max_skips: int = Field(10, ge=1, le=1_000_000)

@@ -8,7 +8,7 @@ import math
 import threading
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Generic, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,15 +55,7 @@ class CameraClock:
         self._offset: int | None = None
 
     def exposed_ns(self, stamp_ns: int, arrived_ns: int) -> int:
-        """When a frame was exposed.
-
-        Parameters
-        ----------
-        stamp_ns
-            The camera's time stamp; 0: it gives none.
-        arrived_ns
-            Monotonic time of its arrival.
-        """
+        """When a frame was exposed, from the camera's time stamp (0: it gives none) and the arrival."""
         if stamp_ns == 0:
             return arrived_ns
         offset = arrived_ns - stamp_ns
@@ -78,22 +70,22 @@ log = logging.getLogger(__name__)
 MAX_WAIT_MS = 50
 
 
-class BlockingCamera(Camera):
+class Connection(Protocol):
+    """A vendor's library with one camera, or a stream."""
+
+    def close(self) -> None:
+        """Disconnect."""
+
+
+C = TypeVar("C", bound=Connection)
+
+
+class BlockingCamera(Camera, Generic[C]):
     """A camera read through a blocking call, which is made in short slices.
 
-    Drivers fill in ``_start_acquisition``, ``_stop_acquisition``, ``_read_frame`` and ``_disconnect`` in
-    place of ``_start``, ``_stop``, ``_next_frame`` and ``_close``; they exclude each other.
-
-    Parameters
-    ----------
-    name
-        Key in ``[devices]``.
-    section
-        Serial number, sensor, region, exposure and rate to begin with.
-    kind
-        Kind of camera, until the device reports its model.
-    counter
-        First and last number of its frame counter.
+    Drivers fill in ``_start_acquisition``, ``_stop_acquisition`` and ``_read_frame`` in place of ``_start``,
+    ``_stop`` and ``_next_frame``; they exclude each other. ``_open`` sets ``_connection``. ``kind`` names the
+    camera until it reports its model; ``counter`` has the first and last number of its frame counter.
     """
 
     def __init__(self, name: str, section: CameraConfig, kind: str, counter: tuple[int, int]) -> None:
@@ -102,6 +94,7 @@ class BlockingCamera(Camera):
         self._info = self._build_info(kind, stand_in=False)
         self._full_scale = np.uint16(self._info.full_scale)
         self._saturation_mask = np.empty((0, 0), np.bool_)
+        self._connection: C | None = None
         self._limits: CameraLimits | None = None
         self._min_rate_hz, self._max_rate_hz = 0.0, math.inf
         self._read_lock = threading.Lock()
@@ -138,9 +131,16 @@ class BlockingCamera(Camera):
     def _read_frame(self, wait_ms: int) -> Frame | None:
         """A frame, or ``None`` when there is none after so many milliseconds (0: at once)."""
 
-    @abc.abstractmethod
     def _disconnect(self) -> None:
         """Give the camera back, if it is connected."""
+        connection, self._connection = self._connection, None
+        if connection is not None:
+            connection.close()
+
+    def _require_connected(self) -> C:
+        if self._connection is None:
+            raise NotOpen(self.name, "is not connected; call open() first")
+        return self._connection
 
     def _build_info(self, model: str, stand_in: bool) -> CameraInfo:
         section = self._section
@@ -201,11 +201,8 @@ class BlockingCamera(Camera):
         except DeviceLost:
             raise
         except DeviceError as error:
-            self._clean_up(lambda: self._restore_settings(before), error)
+            self._clean_up(lambda: setattr(self, "_settings", self._apply_settings(before)), error)
             raise
-
-    def _restore_settings(self, before: CameraSettings) -> None:
-        self._settings = self._apply_settings(before)
 
     def _timeout_hint(self) -> str:
         """What to check when no frame comes."""

@@ -60,32 +60,18 @@ class CameraLimits:
         SettingRejected
             The gain is outside its limits.
         """
-        region, gain = self.region(want.region), self.gain_db(device, want.gain_db)
-        return CameraSettings(
-            region, self.exposure_s(want.exposure_s, max_exposure_s), want.frame_rate_hz, gain
-        )
+        low, high = self.gain.low, self.gain.high
+        if not low - TOLERANCE <= want.gain_db <= high + TOLERANCE:
+            raise SettingRejected(device, f"gain_db is {want.gain_db:g}; it must lie in {low:g}..{high:g}")
+        exposure_us = self.exposure.nearest_valid(want.exposure_s * 1e6)
+        if exposure_us > max_exposure_s * 1e6:
+            exposure_us = self.exposure.round_down(max_exposure_s * 1e6)
+        gain_db = self.gain.nearest_valid(want.gain_db)
+        return CameraSettings(self._region(want.region), exposure_us * 1e-6, want.frame_rate_hz, gain_db)
 
-    def region(self, want: Region) -> Region:
+    def _region(self, want: Region) -> Region:
         """The largest region on the sensor's increments within the requested one, where possible."""
         width, height = round(self.width.round_down(want.width)), round(self.height.round_down(want.height))
         x = min(want.x, round(self.width.high) - width)
         y = min(want.y, round(self.height.high) - height)
         return Region(x - x % max(1, self.x_step), y - y % max(1, self.y_step), width, height)
-
-    def exposure_s(self, want_s: float, max_exposure_s: float) -> float:
-        """Exposure time that fits into a frame."""
-        us = self.exposure.nearest_valid(want_s * 1e6)
-        return (us if us <= max_exposure_s * 1e6 else self.exposure.round_down(max_exposure_s * 1e6)) * 1e-6
-
-    def gain_db(self, device: str, want_db: float) -> float:
-        """Gain on its increments.
-
-        Raises
-        ------
-        SettingRejected
-            Outside its limits.
-        """
-        low, high = self.gain.low, self.gain.high
-        if not low - TOLERANCE <= want_db <= high + TOLERANCE:
-            raise SettingRejected(device, f"gain_db is {want_db:g}; it must lie in {low:g}..{high:g}")
-        return self.gain.nearest_valid(want_db)

@@ -3,74 +3,48 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, TypeVar, get_args, get_type_hints
+from typing import TYPE_CHECKING, TypeVar
 
+from pydantic import ValidationError
+from pydantic_core import ErrorDetails
+
+from escape_hw.config.key_tree import range_text
+from escape_hw.config.section import Section
 from escape_hw.errors import ConfigError
 
 if TYPE_CHECKING:
     from escape_hw.config.devices import CameraConfig, DeviceConfig
     from escape_hw.config.system import SystemConfig
 
-Options = TypeVar("Options")
+Options = TypeVar("Options", bound=Section)
 
 
 def parse_options(kind: type[Options], device: str, section: DeviceConfig) -> Options:
-    """The options of a device section as the driver's dataclass.
-
-    Parameters
-    ----------
-    kind
-        A dataclass whose fields are ``str``, ``int``, ``float``, ``bool`` or a ``Literal`` of such,
-        each with a default.
-    device
-        Key of the device in ``[devices]``.
-    section
-        Its section.
+    """The options of the section ``devices.DEVICE``.
 
     Raises
     ------
     ConfigError
-        Every unknown option (with the nearest one) and every value of a wrong type, at once.
+        Every unknown option (with the nearest one) and every wrong value, at once.
     """
-    hints = get_type_hints(kind)
-    problems, values = [], {}
-    for key, value in section.options.items():
-        where = f"devices.{device}.options.{key}"
-        if key not in hints:
-            near = difflib.get_close_matches(key, hints, n=1)
-            hint = f"did you mean '{near[0]}'? " if near else ""
-            problems.append(f"{where}: unknown option ({hint}there are: {', '.join(hints)})")
-            continue
-        try:
-            values[key] = _coerce_value(hints[key], value)
-        except ValueError as error:
-            problems.append(f"{where}: {value!r}  {error}")
-    if problems:
-        raise ConfigError("\n".join(problems))
-    return kind(**values)
+    try:
+        return kind.model_validate(section.options)
+    except ValidationError as error:
+        problems = (_describe(kind, device, detail) for detail in error.errors(include_url=False))
+        raise ConfigError("\n".join(problems)) from None
 
 
-def require_in_range(device: str, options: object, ranges: Mapping[str, tuple[float, float]]) -> None:
-    """Check numbers among the options of a device.
-
-    Parameters
-    ----------
-    ranges
-        Smallest and largest value of each.
-
-    Raises
-    ------
-    ConfigError
-        Every number that is out of its range, at once.
-    """
-    wrong = [
-        f"devices.{device}.options.{key}: {value:g}  is out of range (allowed range {low:g} to {high:g})"
-        for key, (low, high) in ranges.items()
-        if not low <= (value := getattr(options, key)) <= high
-    ]
-    if wrong:
-        raise ConfigError("\n".join(wrong))
+def _describe(kind: type[Section], device: str, detail: ErrorDetails) -> str:
+    key, fields = str(detail["loc"][0]), kind.model_fields
+    where = f"devices.{device}.options.{key}"
+    if key not in fields:
+        near = difflib.get_close_matches(key, fields, n=1)
+        hint = f"did you mean '{near[0]}'? " if near else ""
+        return f"{where}: unknown option ({hint}there are: {', '.join(fields)})"
+    allowed = range_text(fields[key])
+    outside = detail["type"].startswith(("greater_than", "less_than"))
+    message = "is out of range" if outside else detail["msg"].replace("Input should be", "must be")
+    return f"{where}: {detail['input']!r}  {message}{f' (allowed range {allowed})' if allowed else ''}"
 
 
 def camera_section(device: str, config: SystemConfig) -> CameraConfig:
@@ -87,8 +61,8 @@ def camera_section(device: str, config: SystemConfig) -> CameraConfig:
     return section
 
 
-def require_serial(device: str, section: DeviceConfig) -> str:
-    """The serial number, without which no hardware is opened.
+def require_serial(device: str, section: DeviceConfig) -> None:
+    """Require the serial number, without which no hardware is opened.
 
     Raises
     ------
@@ -99,17 +73,3 @@ def require_serial(device: str, section: DeviceConfig) -> str:
         raise ConfigError(
             f"devices.{device}.serial: ''  a real device is opened by its serial number only; enter it"
         )
-    return section.serial.strip()
-
-
-def _coerce_value(kind: Any, value: Any) -> Any:
-    allowed = get_args(kind)
-    if allowed:
-        if value not in allowed or isinstance(value, bool) != isinstance(allowed[0], bool):
-            raise ValueError(f"must be one of {', '.join(map(repr, allowed))}")
-        return value
-    if kind is float and isinstance(value, int) and not isinstance(value, bool):
-        return float(value)
-    if type(value) is not kind:
-        raise ValueError(f"must be of type {kind.__name__}")
-    return value

@@ -1,109 +1,74 @@
-"""Finds and loads a vendor's shared library, when a device is opened and not before."""
+"""A vendor's shared library, loaded when a device is opened and not before."""
 
 from __future__ import annotations
 
-import ctypes
-import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
-from escape_hw.errors import DeviceError
+from escape_hw.api.discovery import VendorLibrary
+from escape_hw.errors import DeviceError, DeviceLost
 
-#: Symbol that only the stand-ins of this project export.
+#: Symbol that only the stand-ins of this project export; they drive no hardware.
 _STAND_IN = "escape_stand_in"
+#: Type of the result and types of the arguments by the name of a function.
+Prototypes = Mapping[str, tuple[Any, Sequence[Any]]]
 
 
-@dataclass(frozen=True, slots=True)
-class VendorLibrary:
-    """Where a vendor's library may be.
+class LoadedLibrary:
+    """A vendor's library, loaded, with the functions that a driver calls.
+
+    Calls release the interpreter lock.
+
+    Every method of a subclass raises ``DeviceLost`` after an error in :attr:`LOST_CODES` and ``DeviceError``
+    after any other, with the library's explanation.
 
     Parameters
     ----------
-    what
-        Name for people, such as "ALPAO SDK".
-    default
-        File names for the system's loader, the preferred one first.
-    variable
-        Environment variable that may hold a path.
-    source
-        Where the library comes from, for the message when it is missing.
-    """
+    device
+        Name used in error messages.
+    path
+        File or name of the library; empty: the environment variable decides, then the default names.
 
-    title: str
-    default: tuple[str, ...]
-    variable: str
-    source: str
-
-    def load(self, device: str, path: str = "") -> ctypes.CDLL:
-        """Load the library; its calls release the interpreter's lock.
-
-        Parameters
-        ----------
-        device
-            Device that needs it, for messages.
-        path
-            File or name; empty: the environment variable decides, and then the default name.
-
-        Raises
-        ------
-        DeviceError
-            The library is missing or cannot be loaded.
-        """
-        chosen = path or os.environ.get(self.variable, "")
-        failures = []
-        for name in (chosen,) if chosen else self.default:
-            try:
-                return ctypes.CDLL(name)
-            except OSError as error:
-                failures.append(str(error))
-        raise DeviceError(
-            device,
-            f"the library of the {self.title} cannot be loaded ({'; '.join(failures)}); {self.source}, then "
-            f"name its file in the option 'library' of the device or in {self.variable}",
-        )
-
-    def bind(
-        self, device: str, path: str, prototypes: Mapping[str, tuple[Any, Sequence[Any]]]
-    ) -> ctypes.CDLL:
-        """Load the library and declare what the driver calls.
-
-        Parameters
-        ----------
-        device, path
-            As for :meth:`load`.
-        prototypes
-            Type of the result and types of the arguments by the function's name.
-
-        Raises
-        ------
-        DeviceError
-            The library is missing or is another one.
-        """
-        library = self.load(device, path)
-        require_symbols(device, library, list(prototypes))
-        for name, (result, arguments) in prototypes.items():
-            function = getattr(library, name)
-            function.restype, function.argtypes = result, arguments
-        return library
-
-
-def require_symbols(device: str, library: ctypes.CDLL, names: Sequence[str]) -> None:
-    """Check that a library exports what the driver calls.
+    Attributes
+    ----------
+    c
+        The functions.
+    stand_in
+        True for a stand-in of this project.
 
     Raises
     ------
     DeviceError
-        It is another library, or its version is too old.
+        The library is missing, is another one, or its version is too old.
     """
-    loaded_as = vars(library).get("_name", "the library")
-    missing = [name for name in names if not hasattr(library, name)]
-    if missing:
-        raise DeviceError(
-            device, f"{loaded_as} does not export {', '.join(missing)}; is it the right library?"
-        )
 
+    VENDOR: ClassVar[VendorLibrary]
+    PROTOTYPES: ClassVar[Prototypes]
+    #: Errors after which the device must be opened again.
+    LOST_CODES: ClassVar[frozenset[int]] = frozenset()
 
-def is_stand_in(library: ctypes.CDLL) -> bool:
-    """True for a stand-in of this project, which drives no hardware."""
-    return hasattr(library, _STAND_IN)
+    def __init__(self, device: str, path: str = "") -> None:
+        self.device = device
+        vendor = self.VENDOR
+        try:
+            self.c = vendor.load(path)
+        except OSError as error:
+            raise DeviceError(
+                device,
+                f"the library of the {vendor.title} cannot be loaded ({error}); {vendor.source}, then "
+                f"name its file in the option 'library' of the device or in {vendor.variable}",
+            ) from error
+        missing = [name for name in self.PROTOTYPES if not hasattr(self.c, name)]
+        if missing:
+            loaded_as = vars(self.c).get("_name", "the library")
+            raise DeviceError(
+                device, f"{loaded_as} does not export {', '.join(missing)}; is it the right library?"
+            )
+        for name, (result, arguments) in self.PROTOTYPES.items():
+            function = getattr(self.c, name)
+            function.restype, function.argtypes = result, arguments
+        self.stand_in = hasattr(self.c, _STAND_IN)
+
+    def _error(self, code: int, message: str) -> DeviceError:
+        kind = DeviceLost if code in self.LOST_CODES else DeviceError
+        return kind(self.device, message)

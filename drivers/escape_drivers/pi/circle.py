@@ -31,22 +31,12 @@ AxisResponse = tuple[complex, complex]
 
 
 class CircleGenerator:
-    """The wave generators of one stage.
+    """The wave generators of one stage, whose controller is open with the servos on.
 
     Parameters
     ----------
-    name
-        Of the device, for messages.
-    controller
-        Open, servos on.
-    stage
-        Configuration.
-    travel
-        Range and clock.
     responses
         What is known of the axes by servo periods of a turn; measured ones are added.
-    sleep
-        Waits.
 
     Attributes
     ----------
@@ -117,12 +107,7 @@ class CircleGenerator:
 
     # ------------------------------------------------------------------ turning
     def turn(self, modulation: Modulation) -> None:
-        """Turn, and correct until the circle is round.
-
-        Parameters
-        ----------
-        modulation
-            From :meth:`achievable`.
+        """Turn as :meth:`achievable` says, and correct until the circle is round.
 
         Raises
         ------

@@ -39,14 +39,10 @@ _UNITS = {"urad": 1e-6, "µrad": 1e-6, "mrad": 1e-3, "rad": 1.0}
 
 
 class E727:
-    """The controller behind a link.
+    """The controller behind an open link, with the names of the axes in use.
 
-    Parameters
-    ----------
-    link
-        An open link.
-    axes
-        The axes in use.
+    A reply that is not as expected raises :class:`~escape_drivers.pi.gcs.MalformedReply`; a refused command
+    raises :class:`~escape_drivers.pi.gcs.GcsError`.
     """
 
     def __init__(self, link: GcsLink, axes: tuple[str, str]) -> None:
@@ -85,13 +81,7 @@ class E727:
         return self._query_axes("CST?", pi_gcs.values)
 
     def unit_rad(self) -> float:
-        """Radians per unit of the axes.
-
-        Raises
-        ------
-        Garbled
-            The unit is not an angle.
-        """
+        """Radians per unit of the axes, which must be an angle."""
 
         def parse(reply: list[str]) -> float:
             units = pi_gcs.values(reply, self.axes)
@@ -145,13 +135,7 @@ class E727:
     def move_and_wait(
         self, positions: NDArray[np.float64], longest_s: float, sleep: Callable[[float], None]
     ) -> None:
-        """Move both axes and wait until they are there.
-
-        Raises
-        ------
-        DeviceError
-            They are not after ``longest_s`` seconds.
-        """
+        """Move both axes and wait until they are there; ``DeviceError`` after ``longest_s`` seconds."""
         self.set_targets([float(place) for place in positions])
         deadline = time.monotonic() + longest_s
         while not self.on_target():
@@ -182,19 +166,13 @@ class E727:
 
     def clear_error(self) -> None:
         """Read and discard an earlier error, so that it is not attributed to the next command."""
-        number = self.link.query(_parse_number, "ERR?")
+        number = self.link.query(pi_gcs.parse_single_int, "ERR?")
         if number:
             log.warning("%s", GcsError(self.link.name, number, "something before"))
 
     def check_error(self, cause: str) -> None:
-        """Raise the error that a command which takes its time has left behind, if any.
-
-        Raises
-        ------
-        Refused
-            There is one.
-        """
-        number = self.link.query(_parse_number, "ERR?")
+        """Raise the error that a command which takes its time has left behind, if any."""
+        number = self.link.query(pi_gcs.parse_single_int, "ERR?")
         if number:
             raise GcsError(self.link.name, number, cause)
 
@@ -235,9 +213,8 @@ class E727:
         self.link.send_command("WGC", first, 0, second, 0)
         self.link.send_command("WOS", first, 0, second, 0)
         self.link.send_command("WTR", first, rate, int(rate > 1), second, rate, int(rate > 1))
-        self._verify_readback("WSL", [1, 2], self._query_axes("WSL?", pi_gcs.parse_floats), 0)
-        self._verify_readback("WGC", [0, 0], self._query_axes("WGC?", pi_gcs.parse_floats), 0)
-        self._verify_readback("WOS", [0, 0], self._query_axes("WOS?", pi_gcs.parse_floats), 0)
+        for command, want in (("WSL", [1, 2]), ("WGC", [0, 0]), ("WOS", [0, 0])):
+            self._verify_readback(command, want, self._query_axes(f"{command}?", pi_gcs.parse_floats), 0)
         self._verify_readback("WTR", [rate, rate], self._table_rates(), 0)
 
     def start(self) -> None:
@@ -299,12 +276,8 @@ class E727:
     ) -> NDArray[np.float64]:
         """Positions, then targets of both axes ``(points, 4)``, every ``rate`` servo periods from now on.
 
-        Targets are recorded as well, because a recording may begin at any point of the turn.
-
-        Parameters
-        ----------
-        wait
-            Called with the seconds that the recording takes.
+        Targets are recorded as well, because a recording may begin at any point of the turn. ``wait`` is
+        called with the seconds that the recording takes.
         """
         tables = range(1, 5)
         for table, (option, axis) in zip(tables, product((_POSITION, _TARGET), self.axes), strict=True):
@@ -342,11 +315,6 @@ class E727:
 
     def _set_axes(self, command: str, both: Sequence[int | float]) -> None:
         self.link.send_command(command, self.axes[0], both[0], self.axes[1], both[1])
-
-
-def _parse_number(reply: list[str]) -> int:
-    """A reply of one whole number."""
-    return pi_gcs.parse_int(pi_gcs.parse_single_line(reply))
 
 
 def _parse_first_int(text: str) -> int:

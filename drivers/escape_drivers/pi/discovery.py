@@ -5,39 +5,30 @@ A controller serves one client, so the connection is closed at once.
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 
+from escape_drivers.common.discovery import HOST_TIMEOUT_S, probe_hosts
 from escape_drivers.pi.controller import E727
 from escape_drivers.pi.link import GcsLink
 from escape_drivers.pi.transports import TcpTransport
 from escape_hw.api.discovery import DiscoveredDevice
-from escape_hw.errors import DeviceError
-
-log = logging.getLogger(__name__)
 
 #: Port that a controller listens on unless the host is given with another.
 DEFAULT_PORT = 50000
-#: Longest wait for a host, seconds.
-_TIMEOUT_S = 1.0
 
 
 def discover(hosts: Sequence[str]) -> list[DiscoveredDevice]:
     """Entry point ``pi-e727`` of ``escape.discover``: an identity question and nothing else."""
-    found = []
-    for where in hosts:
-        host, _, port = where.partition(":")
-        number = int(port) if port.isdigit() else DEFAULT_PORT
-        link = GcsLink(where, TcpTransport(host, number, _TIMEOUT_S, _TIMEOUT_S), _TIMEOUT_S)
-        try:
-            link.open()
-        except DeviceError as error:
-            log.info("%s", error)
-            continue
-        finally:
-            link.close()
-        found.append(_make_entry(host, number, E727(link, ("1", "2"))))
-    return found
+    return probe_hosts(hosts, DEFAULT_PORT, _probe)
+
+
+def _probe(where: str, host: str, port: int) -> DiscoveredDevice:
+    link = GcsLink(where, TcpTransport(host, port, HOST_TIMEOUT_S, HOST_TIMEOUT_S), HOST_TIMEOUT_S)
+    try:
+        link.open()
+    finally:
+        link.close()
+    return _make_entry(host, port, E727(link, ("1", "2")))
 
 
 def _make_entry(host: str, port: int, controller: E727) -> DiscoveredDevice:

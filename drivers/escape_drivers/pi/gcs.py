@@ -76,18 +76,10 @@ class GcsError(DeviceError):
     def __init__(self, device: str, number: int, command: str) -> None:
         text, remedy = _ERRORS.get(number, ("unknown error number", "see the controller's manual"))
         super().__init__(device, f"refused '{command}': error {number}, {text}; {remedy}")
-        self.number = number
+        self.number, self._command = number, command
 
     def __reduce__(self) -> tuple[object, ...]:
-        return (_rebuild_error, (self.args, self.number))
-
-
-def _rebuild_error(args: tuple[str, str], number: int) -> GcsError:
-    """The same error in another process."""
-    error = GcsError.__new__(GcsError)
-    DeviceError.__init__(error, *args)
-    error.number = number
-    return error
+        return GcsError, (self.device, self.number, self._command)
 
 
 ENCODING = "cp1252"
@@ -96,7 +88,10 @@ MAX_ARGUMENTS, MAX_REPLY = 32, 8 << 20
 
 
 class MalformedReply(Exception):
-    """A reply that does not match the question: link and controller are out of step."""
+    """A reply that does not match the question: link and controller are out of step.
+
+    Raised by every parsing function of this module.
+    """
 
 
 def format_command(mnemonic: str, *arguments: str | float) -> bytes:
@@ -138,13 +133,7 @@ class ReplyReader:
         return len(self._buffer)
 
     def feed(self, data: bytes) -> None:
-        """Add what arrived.
-
-        Raises
-        ------
-        Garbled
-            A reply without end.
-        """
+        """Add what arrived; raises :class:`MalformedReply` without an end."""
         self._buffer += data.replace(b"\0", b"")
         if len(self._buffer) > MAX_REPLY:
             size = len(self._buffer)
@@ -170,26 +159,14 @@ class ReplyReader:
 
 
 def parse_single_line(reply: Sequence[str]) -> str:
-    """The only line of a reply.
-
-    Raises
-    ------
-    Garbled
-        There are more.
-    """
+    """The only line of a reply."""
     if len(reply) != 1:
         raise MalformedReply(f"{len(reply)} lines where one was due: {reply[0][:40]!r} ...")
     return reply[0]
 
 
 def parse_float(text: str) -> float:
-    """A finite number.
-
-    Raises
-    ------
-    Garbled
-        It is none.
-    """
+    """A finite number."""
     try:
         value = float(text)
     except ValueError:
@@ -200,27 +177,20 @@ def parse_float(text: str) -> float:
 
 
 def parse_int(text: str, base: int = 10) -> int:
-    """A whole number, also with a prefix when ``base`` is 0.
-
-    Raises
-    ------
-    Garbled
-        It is none.
-    """
+    """A whole number, also with a prefix when ``base`` is 0."""
     try:
         return int(text, base)
     except ValueError:
         raise MalformedReply(f"{text[:40]!r} where a whole number was due") from None
 
 
-def values(reply: Sequence[str], keys: Sequence[str]) -> list[str]:
-    """The values of lines ``KEY=value`` that must name just these keys, in this order.
+def parse_single_int(reply: Sequence[str]) -> int:
+    """A reply of one whole number."""
+    return parse_int(parse_single_line(reply))
 
-    Raises
-    ------
-    Garbled
-        Other keys, or another form.
-    """
+
+def values(reply: Sequence[str], keys: Sequence[str]) -> list[str]:
+    """The values of lines ``KEY=value`` that must name just these keys, in this order."""
     pairs = [text.partition("=") for text in reply]
     found = [key.strip() for key, equals, _ in pairs if equals]
     if found != list(keys):
@@ -234,13 +204,7 @@ def parse_floats(reply: Sequence[str], keys: Sequence[str]) -> list[float]:
 
 
 def array(reply: Sequence[str], columns: int, rows: int) -> NDArray[np.float64]:
-    """The numbers ``(rows, columns)`` of a reply to ``DRR?`` or ``GWD?``.
-
-    Raises
-    ------
-    Garbled
-        No header, or not that many numbers.
-    """
+    """The numbers ``(rows, columns)`` of a reply to ``DRR?`` or ``GWD?``."""
     header = [k for k, text in enumerate(reply) if text.strip() == "# END_HEADER"]
     if len(header) != 1 or not all(text.startswith("#") for text in reply[: header[0]]):
         raise MalformedReply(f"{reply[0][:40]!r} ... where an array with a header was due")

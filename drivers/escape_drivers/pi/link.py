@@ -31,16 +31,7 @@ class GcsLink:
 
     A question whose answer is lost or invalid is repeated once, after both ends have been brought
     together again: an identity question goes out, and everything up to its answer is thrown away. A
-    dead peer is noticed within three times ``timeout_s``; from then on every call fails at once.
-
-    Parameters
-    ----------
-    name
-        Of the device, for messages.
-    transport
-        The wire.
-    timeout_s
-        Longest wait for an answer.
+    dead peer is noticed within three times ``timeout_s``; from then on every call raises ``DeviceLost``.
     """
 
     def __init__(self, name: str, transport: Transport, timeout_s: float) -> None:
@@ -83,18 +74,11 @@ class GcsLink:
 
     # ------------------------------------------------------------------ exchange
     def query(self, parse: Callable[[list[str]], T], question: str, *arguments: str | float) -> T:
-        """The answer to a question, understood.
-
-        Parameters
-        ----------
-        parse
-            Makes something of the reply's lines; raises :class:`~escape_drivers.pi.gcs.MalformedReply`.
-        question
-            Mnemonic, such as ``POS?``.
+        """The answer to a question (a mnemonic such as ``POS?``) as ``parse`` reads the reply's lines.
 
         Raises
         ------
-        Refused
+        GcsError
             The controller does not answer that question.
         DeviceLost
             The connection is lost.
@@ -112,16 +96,13 @@ class GcsLink:
     def send_command(self, command: str, *arguments: str | float, repeatable: bool = True) -> None:
         """Send a command and read the error number.
 
-        Parameters
-        ----------
-        again
-            The command may be repeated when its confirmation was lost: it names a state, not a change.
+        A ``repeatable`` command names a state, not a change; it is repeated when its confirmation was lost.
 
         Raises
         ------
-        Refused
+        GcsError
             The controller refused it.
-        Unconfirmed
+        CommandUnconfirmed
             Whether the command was executed is unknown.
         DeviceLost
             The connection is lost.
@@ -130,7 +111,7 @@ class GcsLink:
         with self._lock:
             for last in (not repeatable, True):
                 try:
-                    number = self._exchange(text + b"ERR?\n", _parse_error_number)
+                    number = self._exchange(text + b"ERR?\n", pi_gcs.parse_single_int)
                 except MalformedReply as cause:
                     number = self._resynchronise(cause)
                     if number == 0:
@@ -253,7 +234,7 @@ class GcsLink:
         """The answer to ``ERR?`` after remaining identity replies; ``None`` without one in time."""
         for reply in self._replies(deadline):
             if not reply[-1].endswith(self.identity):
-                return _parse_error_number(reply) if reply[-1].strip().isdigit() else None
+                return pi_gcs.parse_single_int(reply) if reply[-1].strip().isdigit() else None
         return None
 
     def require_connected(self) -> None:
@@ -272,11 +253,6 @@ class GcsLink:
             f"'{_format_for_message(text)}' was not confirmed ({cause}); the link works again, but "
             "whether the command was executed is unknown: park, then start again",
         )
-
-
-def _parse_error_number(reply: list[str]) -> int:
-    """The number returned by ``ERR?``."""
-    return pi_gcs.parse_int(pi_gcs.parse_single_line(reply))
 
 
 def _format_for_message(text: bytes) -> str:

@@ -9,7 +9,7 @@ import logging
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -62,12 +62,6 @@ def start_up(
     controller.move_and_wait(travel.centre, stage.settle_s, sleep)
 
 
-def shut_down(controller: E727) -> None:
-    """Servos off, no volts; the stage has been stopped and centred before."""
-    controller.set_servo(False)
-    controller.set_volts(0.0)
-
-
 def _auto_zero(name: str, controller: E727, stage: StageConfig, sleep: Callable[[float], None]) -> None:
     """One axis after the other, each until it is done."""
     for number, axis in enumerate(stage.axes):
@@ -95,31 +89,20 @@ _UNREACHABLE_NOTE = (
 
 
 def make_modulator(name: str, config: SystemConfig, shared: dict[str, object]) -> PiModulator:
-    """Entry point ``pi-e727``.
-
-    Raises
-    ------
-    ConfigError
-        The system has no modulator.
-    """
+    """Entry point ``pi-e727``; raises ``ConfigError`` if the system has no modulator."""
     section = config.devices.modulator
     if section is None:
         raise ConfigError(f"system {config.system.name!r} has no [devices.modulator] section")
     return PiModulator(name, section, lambda: make_transport(section, config, shared))
 
 
-class _Connection:
+class _Connection(NamedTuple):
     """What there is while the controller is connected."""
 
-    def __init__(
-        self, controller: E727, travel: AxisTravel, circle_generator: CircleGenerator, info: ModulatorInfo
-    ) -> None:
-        self.controller, self.travel, self.circle_generator, self.info = (
-            controller,
-            travel,
-            circle_generator,
-            info,
-        )
+    controller: E727
+    travel: AxisTravel
+    circle_generator: CircleGenerator
+    info: ModulatorInfo
 
 
 class PiModulator(TipTiltModulator):
@@ -131,17 +114,6 @@ class PiModulator(TipTiltModulator):
 
     When the link is lost the stage continues its motion and cannot be reached: every call raises this at
     once, and opening anew stops and centres it.
-
-    Parameters
-    ----------
-    name
-        In messages.
-    section
-        Configuration.
-    connect
-        Makes the wire.
-    sleep
-        Waits.
     """
 
     def __init__(
@@ -229,7 +201,8 @@ class PiModulator(TipTiltModulator):
     def _switch_off(self, controller: E727) -> None:
         """Servos off and zero volts, unless the link was lost before."""
         if controller.link.is_alive:
-            shut_down(controller)
+            controller.set_servo(False)
+            controller.set_volts(0.0)
 
     # ------------------------------------------------------------------ the hooks
     def _check(self, want: Modulation) -> Modulation:

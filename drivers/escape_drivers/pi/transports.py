@@ -18,7 +18,9 @@ if TYPE_CHECKING:
     from escape_hw.config.system import SystemConfig
 
 
-_RECEIVE_BYTES = 65536
+log = logging.getLogger(__name__)
+
+_RECEIVE_BYTES, _USB_READ_BYTES = 65536, 16384
 
 
 class TransportLost(Exception):
@@ -26,60 +28,27 @@ class TransportLost(Exception):
 
 
 class Transport(Protocol):
-    """A wire.
-
-    Attributes
-    ----------
-    where
-        What is connected, for messages.
-    """
+    """A wire. ``where`` names it in messages; all but ``close`` raise ``TransportLost`` on failure."""
 
     where: str
 
     def open(self) -> None:
-        """Connect.
-
-        Raises
-        ------
-        WireLost
-            No device answers.
-        """
-        ...
+        """Connect."""
 
     def close(self) -> None:
         """Disconnect; may be repeated, never raises."""
-        ...
 
     def write(self, data: bytes) -> None:
-        """Send all of it.
-
-        Raises
-        ------
-        WireLost
-            The transport is lost or accepts no more bytes.
-        """
-        ...
+        """Send all of it."""
 
     def read(self, timeout_s: float) -> bytes:
-        """What has arrived, as soon as there is something; empty after the time.
-
-        Raises
-        ------
-        WireLost
-            The transport is lost.
-        """
-        ...
+        """What has arrived, as soon as there is something; empty after the time."""
 
 
 class TcpTransport:
     """The controller's network port; it takes one client at a time.
 
-    Parameters
-    ----------
-    host, port
-        Where it listens.
-    connect_s, timeout_s
-        Longest wait for a connection, and for the network to take a command.
+    ``connect_s`` and ``timeout_s`` limit the wait for a connection, and for the network to take a command.
     """
 
     def __init__(self, host: str, port: int, connect_s: float, timeout_s: float) -> None:
@@ -150,17 +119,7 @@ class TcpTransport:
 
 
 class SerialTransport:
-    """A serial line, or USB that looks like one: 8 bits, no parity, 1 stop bit, no flow control.
-
-    Parameters
-    ----------
-    port
-        Device file.
-    baud
-        Bits per second.
-    timeout_s
-        Longest wait for the line to take a command.
-    """
+    """A serial line, or USB that looks like one: 8 bits, no parity, 1 stop bit, no flow control."""
 
     def __init__(self, port: str, baud: int, timeout_s: float) -> None:
         self.where = port
@@ -222,11 +181,6 @@ class SerialTransport:
         )
 
 
-_USB_READ_BYTES = 16384
-
-log = logging.getLogger(__name__)
-
-
 class UsbTransport:
     """A controller found by the vendor's number and its serial number.
 
@@ -235,7 +189,7 @@ class UsbTransport:
     vendor, product
         USB numbers; ``None``: any product of the vendor's.
     serial
-        Serial number that the device's descriptor must end with or contain; empty: the only one there is.
+        Serial number that the device's descriptor must contain; empty: the only one there is.
     timeout_s
         Longest wait for it to take a command.
     backend
@@ -371,19 +325,10 @@ class UsbTransport:
 
 #: Where an emulated controller listens, ``HOST:PORT``; goes before the configuration, for rehearsals.
 ADDRESS_VARIABLE = "ESCAPE_E727"
-#: Name of the emulator in the group ``escape.emulators``.
-_EMULATOR = "e727"
 
 
 def make_transport(section: ModulatorConfig, config: SystemConfig, shared: dict[str, object]) -> Transport:
     """The wire that ``devices.modulator.wire`` names, or :data:`ADDRESS_VARIABLE`; not open.
-
-    Parameters
-    ----------
-    section
-        The modulator's configuration.
-    config, shared
-        The whole one and the opened system's dictionary, for an emulator that joins the system's twins.
 
     Raises
     ------
@@ -412,47 +357,24 @@ def make_transport(section: ModulatorConfig, config: SystemConfig, shared: dict[
 
     options = {"serial": section.serial, **{key: str(value) for key, value in section.options.items()}}
     request = EmulatorRequest("127.0.0.1", 0, False, options, shared, config)
-    return EmulatedTransport(emulator_factory(_EMULATOR)(request), wire.connect_s, wire.timeout_s)
+    return EmulatedTransport(emulator_factory("e727")(request), wire.connect_s, wire.timeout_s)
 
 
-class EmulatedTransport:
-    """The network wire to an emulator in this process, which lives as long as the connection.
-
-    Parameters
-    ----------
-    emulator
-        Not started.
-    connect_s, timeout_s
-        As of :class:`~escape_drivers.pi.transports.TcpTransport`.
-    """
+class EmulatedTransport(TcpTransport):
+    """The network wire to an emulator in this process, which lives as long as the connection."""
 
     def __init__(self, emulator: Emulator, connect_s: float, timeout_s: float) -> None:
-        self._emulator, self._timeouts = emulator, (connect_s, timeout_s)
-        self._transport: TcpTransport | None = None
+        super().__init__("", 0, connect_s, timeout_s)
+        self._emulator = emulator
         self.where = "emulator"
 
     def open(self) -> None:
         """Start the emulator and connect to it."""
         host, _, port = self._emulator.start().removeprefix("tcp ").rpartition(":")
-        self._transport = TcpTransport(host, int(port), *self._timeouts)
-        self._transport.open()
+        self._address = host, int(port)
+        super().open()
 
     def close(self) -> None:
         """Disconnect and stop the emulator."""
-        if self._transport is not None:
-            self._transport.close()
-            self._transport = None
+        super().close()
         self._emulator.stop()
-
-    def write(self, data: bytes) -> None:
-        """Send all of it."""
-        self._require_connected().write(data)
-
-    def read(self, timeout_s: float) -> bytes:
-        """What has arrived."""
-        return self._require_connected().read(timeout_s)
-
-    def _require_connected(self) -> TcpTransport:
-        if self._transport is None:
-            raise TransportLost("the emulator is not connected")
-        return self._transport

@@ -105,10 +105,8 @@ def fit_phasors(
 
     Parameters
     ----------
-    track
-        Records ``(samples, columns)``.
-    per_turn
-        Samples of a turn.
+    records
+        ``(samples, columns)``.
 
     Returns
     -------

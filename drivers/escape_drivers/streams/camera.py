@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
@@ -14,7 +14,8 @@ from escape_drivers.common.camera import BlockingCamera
 from escape_drivers.common.options import camera_section, parse_options
 from escape_drivers.streams.source import Opener, open_milk, open_pyrtc, open_stream, with_stream_serial
 from escape_hw.api.camera import CameraInfo, CameraSettings, Frame
-from escape_hw.errors import DeviceError, DeviceLost, NotOpen
+from escape_hw.config.section import Section
+from escape_hw.errors import DeviceError, DeviceLost
 from escape_hw.io.interchange.stream import Publication, Stream, StreamReadError
 
 if TYPE_CHECKING:
@@ -28,8 +29,7 @@ _MIN_RATE_FRAMES = 5
 _COUNTER_RANGE = (0, 2**63 - 1)
 
 
-@dataclass(frozen=True, slots=True)
-class StreamCameraOptions:
+class StreamCameraOptions(Section):
     """The ``[devices.wfs.options]`` of these drivers.
 
     Parameters
@@ -48,52 +48,28 @@ class StreamCameraOptions:
 
 
 def make_pyrtc_camera(name: str, config: SystemConfig, shared: dict[str, object]) -> StreamCamera:
-    """Entry point ``pyrtc-camera``.
-
-    Raises
-    ------
-    ConfigError
-        The camera or its stream is missing, or an option is unknown.
-    """
+    """Entry point ``pyrtc-camera``.."""
     return _build(name, config, open_pyrtc, "pyRTC stream")
 
 
 def make_milk_camera(name: str, config: SystemConfig, shared: dict[str, object]) -> StreamCamera:
-    """Entry point ``milk-camera``.
-
-    Raises
-    ------
-    ConfigError
-        The camera or its stream is missing, or an option is unknown.
-    """
+    """Entry point ``milk-camera``.."""
     return _build(name, config, open_milk, "milk image")
 
 
 def _build(name: str, config: SystemConfig, opener: Opener, kind: str) -> StreamCamera:
+    """Raises ``ConfigError`` when the camera or its stream is missing, or an option is wrong."""
     section = camera_section(name, config)
     options = parse_options(StreamCameraOptions, name, section)
     return StreamCamera(name, with_stream_serial(name, section, options.stream), options, opener, kind)
 
 
-class StreamCamera(BlockingCamera):
+class StreamCamera(BlockingCamera[Stream]):
     """A camera whose frames another program acquires and publishes.
 
     Its numbers are those of the writes, so a write that was overwritten before it was read is a lost frame.
     Exposure and gain are reported as configured, because the stream has no metadata; the rate is measured on
     opening, while frames come. A region is cut out of the stream.
-
-    Parameters
-    ----------
-    name
-        Key in ``[devices]``.
-    section
-        Sensor, region and exposure.
-    options
-        Of this driver.
-    opener
-        Opens the stream.
-    kind
-        What kind of stream it is.
     """
 
     def __init__(
@@ -102,14 +78,13 @@ class StreamCamera(BlockingCamera):
         super().__init__(name, section, kind, _COUNTER_RANGE)
         self._options, self._opener, self._kind = options, opener, kind
         self._info = self._make_info(kind)
-        self._stream: Stream | None = None
         self._last_count, self._written_ns = 0, 0
 
     def _make_info(self, kind: str) -> CameraInfo:
         return replace(self._build_info(kind, stand_in=False), simulated=self._options.simulated)
 
     def _open(self) -> None:
-        stream = self._stream = open_stream(self.name, self._opener, self._options.stream, write=False)
+        stream = self._connection = open_stream(self.name, self._opener, self._options.stream, write=False)
         if len(stream.shape) != 2:
             raise DeviceError(
                 self.name, f"stream '{stream.name}' has shape {stream.shape}; a camera's frames have two axes"
@@ -119,11 +94,6 @@ class StreamCamera(BlockingCamera):
         now = self._section.settings()
         rate = self._measure_rate(stream) or now.frame_rate_hz
         self._settings = replace(now, frame_rate_hz=rate, exposure_s=min(now.exposure_s, 1 / rate))
-
-    def _disconnect(self) -> None:
-        stream, self._stream = self._stream, None
-        if stream is not None:
-            stream.close()
 
     def _check(self, want: CameraSettings) -> CameraSettings:
         """Any region; other settings belong to the publishing program."""
@@ -184,8 +154,3 @@ class StreamCamera(BlockingCamera):
         steps = [(b[1] - a[1]) / (b[0] - a[0]) for a, b in pairwise(times)]
         median_period_ns = float(np.median(steps))
         return 1e9 / median_period_ns if median_period_ns > 0 else None
-
-    def _require_connected(self) -> Stream:
-        if self._stream is None:
-            raise NotOpen(self.name, "is not connected; call open() first")
-        return self._stream

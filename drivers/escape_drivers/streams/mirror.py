@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
-from escape_drivers.common.options import parse_options, require_in_range
+from escape_drivers.common.options import parse_options
 from escape_drivers.streams.source import Opener, open_milk, open_pyrtc, open_stream, with_stream_serial
 from escape_hw.api.mirror import DeformableMirror, DMInfo
+from escape_hw.config.section import Section
 from escape_hw.errors import DeviceError
 from escape_hw.io.interchange.stream import Stream
 
@@ -19,8 +20,7 @@ if TYPE_CHECKING:
     from escape_hw.config.system import SystemConfig
 
 
-@dataclass(frozen=True, slots=True)
-class StreamMirrorOptions:
+class StreamMirrorOptions(Section):
     """The ``[devices.dm.options]`` of these drivers.
 
     Parameters
@@ -34,36 +34,24 @@ class StreamMirrorOptions:
     """
 
     stream: str = ""
-    scale: float = 1.0
+    scale: float = Field(1.0, ge=1e-12, le=1e12)
     simulated: bool = False
 
 
 def make_pyrtc_mirror(name: str, config: SystemConfig, shared: dict[str, object]) -> StreamMirror:
-    """Entry point ``pyrtc-mirror``.
-
-    Raises
-    ------
-    ConfigError
-        The stream is missing, or an option is unknown.
-    """
+    """Entry point ``pyrtc-mirror``.."""
     return _build(name, config, open_pyrtc, "pyRTC stream")
 
 
 def make_milk_mirror(name: str, config: SystemConfig, shared: dict[str, object]) -> StreamMirror:
-    """Entry point ``milk-mirror``.
-
-    Raises
-    ------
-    ConfigError
-        The stream is missing, or an option is unknown.
-    """
+    """Entry point ``milk-mirror``.."""
     return _build(name, config, open_milk, "milk image")
 
 
 def _build(name: str, config: SystemConfig, opener: Opener, kind: str) -> StreamMirror:
+    """Raises ``ConfigError`` when the stream is missing or an option is wrong."""
     section = config.devices.dm
     options = parse_options(StreamMirrorOptions, name, section)
-    require_in_range(name, options, {"scale": (1e-12, 1e12)})
     return StreamMirror(name, with_stream_serial(name, section, options.stream), options, opener, kind)
 
 
@@ -72,19 +60,6 @@ class StreamMirror(DeformableMirror):
 
     The stream holds one number per actuator, or a map of the actuator layout.
     There is no acknowledgement: a command counts as sent when it is published.
-
-    Parameters
-    ----------
-    name
-        Key in ``[devices]``.
-    section
-        Geometry and limits.
-    options
-        Of this driver.
-    opener
-        Opens the stream.
-    kind
-        What kind of stream it is.
     """
 
     def __init__(

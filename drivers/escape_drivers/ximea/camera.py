@@ -5,18 +5,19 @@ from __future__ import annotations
 import ctypes
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from escape_drivers.common.camera import BlockingCamera
 from escape_drivers.common.camera_limits import CameraLimits, ParameterRange
-from escape_drivers.common.options import camera_section, parse_options, require_in_range, require_serial
+from escape_drivers.common.options import camera_section, parse_options, require_serial
 from escape_drivers.ximea.library import NO_IMAGE, TIMEOUT, XiImage, XimeaLibrary
 from escape_hw.api.camera import CameraSettings, Frame, Region
-from escape_hw.errors import DeviceError, NotOpen
+from escape_hw.config.section import Section
+from escape_hw.errors import DeviceError
 
 if TYPE_CHECKING:
     from escape_hw.config.devices import CameraConfig
@@ -29,16 +30,11 @@ _BINNINGS = {"binning": 0, "skipping": 1}
 _TRIGGERS = {"off": 0, "rising": 1, "falling": 2}
 _UNSAFE, _GPI_TRIGGER, _GPO_EXPOSURE, _ZERO_ROT = 0, 1, 4, 0
 _FREE_RUN, _FRAME_RATE = 0, 1
-_RANGES = {
-    "downsampling": (1, 16), "queue": (2, 1000), "gpi": (1, 16), "trigger_margin": (0, 0.5),
-    "bandwidth_mbit": (0, 100_000),
-}  # fmt: skip
 #: Not a frame number; remains when the library is too old to fill the field.
 _NO_FRAME_NUMBER = 2**32 - 1
 
 
-@dataclass(frozen=True, slots=True)
-class XimeaOptions:
+class XimeaOptions(Section):
     """The ``[devices.wfs.options]`` of this driver.
 
     Parameters
@@ -67,17 +63,17 @@ class XimeaOptions:
     """
 
     library: str = ""
-    downsampling: int = 1
+    downsampling: int = Field(1, ge=1, le=16)
     downsampling_type: Literal["binning", "skipping"] = "binning"
     format: Literal["RAW16", "MONO16"] = "RAW16"
     newest: bool = True
-    queue: int = 4
+    queue: int = Field(4, ge=2, le=1000)
     trigger: Literal["off", "rising", "falling"] = "off"
-    gpi: int = 1
-    trigger_margin: float = 0.02
+    gpi: int = Field(1, ge=1, le=16)
+    trigger_margin: float = Field(0.02, ge=0, le=0.5)
     exposure_output: bool = False
     zero_rot: Literal["", "on", "off"] = ""
-    bandwidth_mbit: int = 0
+    bandwidth_mbit: int = Field(0, ge=0, le=100_000)
 
     def sdk_parameters(self, bit_depth: int) -> list[tuple[str, int]]:
         """Parameters to set after opening, in order; none of them can change while acquiring."""
@@ -110,41 +106,23 @@ class XimeaOptions:
 
 
 def make_camera(name: str, config: SystemConfig, shared: dict[str, object]) -> XimeaCamera:
-    """Entry point ``ximea``.
-
-    Raises
-    ------
-    ConfigError
-        The camera or its serial number is missing, or an option is unknown.
-    """
+    """Entry point ``ximea``; raises ``ConfigError`` if its serial number is missing or an option is wrong."""
     section = camera_section(name, config)
     require_serial(name, section)
-    options = parse_options(XimeaOptions, name, section)
-    require_in_range(name, options, _RANGES)
-    return XimeaCamera(name, section, options)
+    return XimeaCamera(name, section, parse_options(XimeaOptions, name, section))
 
 
-class XimeaCamera(BlockingCamera):
+class XimeaCamera(BlockingCamera[XimeaLibrary]):
     """A XIMEA camera.
 
     Frames are copied out of the library's ring at once, so that nothing overwrites them. Losses show as
     gaps of the camera's own counter. With a trigger the frame rate is that of the edges, and the one
     configured is only stated.
-
-    Parameters
-    ----------
-    name
-        Key in ``[devices]``.
-    section
-        Serial number, sensor, region, exposure and rate to begin with.
-    options
-        Of this driver.
     """
 
     def __init__(self, name: str, section: CameraConfig, options: XimeaOptions) -> None:
         super().__init__(name, section, "XIMEA camera", (0, _NO_FRAME_NUMBER))
         self._options = options
-        self._library: XimeaLibrary | None = None
         self._image = XiImage(size=ctypes.sizeof(XiImage))
         self._address = ctypes.c_void_p(ctypes.addressof(self._image))
         self._get_image: Callable[..., int] = _raise_not_connected
@@ -153,31 +131,19 @@ class XimeaCamera(BlockingCamera):
 
     @property
     def handle(self) -> ctypes.c_void_p:
-        """The library's handle, for calls that this driver does not make.
-
-        Raises
-        ------
-        NotOpen
-            The camera is not connected.
-        """
+        """The library's handle, for calls that this driver does not make; raises ``NotOpen`` when closed."""
         handle = self._require_connected().handle
         assert handle is not None
         return handle
 
     def temperature_c(self) -> float:
-        """Temperature of the sensor's chip in degrees Celsius.
-
-        Raises
-        ------
-        NotOpen, DeviceError
-            The camera is not connected, or does not report it.
-        """
+        """Temperature of the sensor's chip in degrees Celsius, if it reports it."""
         self.require_open()
         with self._read_lock:
             return self._require_connected().get_float("chip_temp")
 
     def _open(self) -> None:
-        library = self._library = XimeaLibrary(self.name, self._options.library)
+        library = self._connection = XimeaLibrary(self.name, self._options.library)
         library.open(self._section.serial.strip())
         for name, value in self._options.sdk_parameters(self._section.bit_depth):
             library.set(name, value)
@@ -194,11 +160,9 @@ class XimeaCamera(BlockingCamera):
         self._settings = self._apply_settings(self._check(self._section.settings()))
 
     def _disconnect(self) -> None:
-        library, self._library = self._library, None
         self._get_image = _raise_not_connected
         self._frame_views.clear()
-        if library is not None and library.handle is not None:
-            self._attempt(library.close)
+        self._attempt(super()._disconnect)
 
     def _max_exposure_s(self, want: CameraSettings) -> float:
         """Longest exposure; with a trigger, one that leaves the camera ready for the next edge."""
@@ -281,11 +245,6 @@ class XimeaCamera(BlockingCamera):
         view: NDArray[np.uint16] = np.ndarray((height, width), np.uint16, buffer=bytes_, strides=(pitch, 2))
         self._frame_views[image.bp] = view
         return view
-
-    def _require_connected(self) -> XimeaLibrary:
-        if self._library is None:
-            raise NotOpen(self.name, "is not connected; call open() first")
-        return self._library
 
 
 def _reset_offset(library: XimeaLibrary) -> None:

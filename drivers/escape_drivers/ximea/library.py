@@ -9,8 +9,9 @@ import ctypes
 from ctypes import POINTER, c_char_p, c_double, c_float, c_int, c_uint32, c_void_p
 from typing import Any
 
-from escape_drivers.common.vendor_library import VendorLibrary, is_stand_in
-from escape_hw.errors import DeviceError, DeviceLost
+from escape_drivers.common.vendor_library import LoadedLibrary, Prototypes
+from escape_hw.api.discovery import VendorLibrary
+from escape_hw.errors import DeviceError
 
 _RECONNECT_HINT = "check cable and power, then open the camera again"
 _IN_USE_HINT = (
@@ -46,8 +47,6 @@ ERRORS: dict[int, tuple[str, str]] = {
     119: ("not available in this context", ""),
 }
 NO_IMAGE, TIMEOUT, STOPPED = 9, 10, 45
-#: Errors after which the camera must be opened again.
-LOST_CODES = frozenset({1, 55, 56})
 
 
 def describe_error(code: int) -> str:
@@ -105,7 +104,7 @@ class XiImage(ctypes.Structure):
     )
 
 
-_PROTOTYPES: dict[str, list[Any]] = {
+_ARGUMENTS: dict[str, list[Any]] = {
     "xiOpenDeviceBy": [c_int, c_char_p, POINTER(c_void_p)],
     "xiCloseDevice": [c_void_p],
     "xiStartAcquisition": [c_void_p],
@@ -119,37 +118,20 @@ _PROTOTYPES: dict[str, list[Any]] = {
 }
 
 
-class XimeaLibrary:
-    """The library, loaded, with one camera.
+_PROTOTYPES: Prototypes = {name: (c_int, arguments) for name, arguments in _ARGUMENTS.items()}
 
-    Parameters
-    ----------
-    device
-        Name used in error messages.
-    path
-        Of the library; empty: the environment, then the default names.
 
-    Raises
-    ------
-    DeviceError
-        The library is missing or is another one.
-    """
+class XimeaLibrary(LoadedLibrary):
+    """The library, loaded, with one camera."""
+
+    VENDOR, PROTOTYPES, LOST_CODES = XIAPI, _PROTOTYPES, frozenset({1, 55, 56})
 
     def __init__(self, device: str, path: str = "") -> None:
-        self.device = device
-        prototypes = {name: (c_int, arguments) for name, arguments in _PROTOTYPES.items()}
-        self.c = XIAPI.bind(device, path, prototypes)
-        self.stand_in = is_stand_in(self.c)
+        super().__init__(device, path)
         self.handle: c_void_p | None = None
 
     def open(self, serial: str) -> None:
-        """Connect to the camera of a serial number.
-
-        Raises
-        ------
-        DeviceError
-            There is none, or another process has it.
-        """
+        """Connect to the camera of a serial number."""
         handle = c_void_p()
         code = self.c.xiOpenDeviceBy(_BY_SERIAL, serial.encode(), ctypes.byref(handle))
         if code != 0:
@@ -157,88 +139,46 @@ class XimeaLibrary:
         self.handle = handle
 
     def close(self) -> None:
-        """Disconnect.
-
-        Raises
-        ------
-        DeviceLost, DeviceError
-            It failed; the handle is given up all the same.
-        """
+        """Disconnect; the handle is given up also after an error."""
         handle, self.handle = self.handle, None
-        self._check_code("xiCloseDevice", self.c.xiCloseDevice(handle))
+        if handle is not None:
+            self._check_code("xiCloseDevice", self.c.xiCloseDevice(handle))
 
     def start(self) -> None:
-        """Start acquisition.
-
-        Raises
-        ------
-        DeviceLost, DeviceError
-            It failed.
-        """
+        """Start acquisition."""
         self._check_code("xiStartAcquisition", self.c.xiStartAcquisition(self.handle))
 
     def stop(self) -> None:
-        """Stop acquisition; that it has stopped already, as after a reset, will do.
-
-        Raises
-        ------
-        DeviceLost, DeviceError
-            It failed.
-        """
+        """Stop acquisition; no error if it has stopped already, as after a reset."""
         code = self.c.xiStopAcquisition(self.handle)
         self._check_code("xiStopAcquisition", 0 if code == STOPPED else code)
 
     def set(self, name: str, value: int | float) -> None:
-        """Set a parameter, of the type that the value has.
-
-        Raises
-        ------
-        DeviceLost, DeviceError
-            It was refused.
-        """
+        """Set a parameter, of the type that the value has."""
         function = self.c.xiSetParamFloat if isinstance(value, float) else self.c.xiSetParamInt
         self._check_code(f"{name} = {value:g}", function(self.handle, name.encode(), value))
 
     def get_int(self, name: str) -> int:
-        """Read an integer parameter.
-
-        Raises
-        ------
-        DeviceLost, DeviceError
-            It was refused.
-        """
+        """Read an integer parameter."""
         value = c_int()
         self._check_code(name, self.c.xiGetParamInt(self.handle, name.encode(), ctypes.byref(value)))
         return value.value
 
     def get_float(self, name: str) -> float:
-        """Read a floating-point parameter.
-
-        Raises
-        ------
-        DeviceLost, DeviceError
-            It was refused.
-        """
+        """Read a floating-point parameter."""
         value = c_float()
         self._check_code(name, self.c.xiGetParamFloat(self.handle, name.encode(), ctypes.byref(value)))
         return value.value
 
     def get_text(self, name: str) -> str:
-        """Read a text parameter.
-
-        Raises
-        ------
-        DeviceLost, DeviceError
-            It was refused.
-        """
+        """Read a text parameter."""
         buffer = ctypes.create_string_buffer(_TEXT_BYTES)
         self._check_code(name, self.c.xiGetParamString(self.handle, name.encode(), buffer, _TEXT_BYTES))
         return buffer.value.decode(errors="replace")
 
     def error_for(self, what: str, code: int) -> DeviceError:
         """The error to raise for a code."""
-        kind = DeviceLost if code in LOST_CODES else DeviceError
-        return kind(self.device, f"{what}: {describe_error(code)}")
+        return self._error(code, f"{what}: {describe_error(code)}")
 
     def _check_code(self, what: str, code: int) -> None:
         if code != 0:

@@ -45,7 +45,7 @@ def measure_model_psf(bench: Bench, *, frames: int = 20) -> Procedure[NDArray[np
             frame = science.next_frame(timeout_s)
             clipped += is_peak_saturated(frame)
             total = total + frame.data
-            if report.due():
+            if report.is_due():
                 yield report(done + 1)
     finally:
         science.stop()

@@ -283,7 +283,7 @@ def _average_frames(bench: Bench, frames: int, stage: str) -> Procedure[NDArray[
     total, report = np.zeros((), np.float64), Reporter(stage, frames)
     for done in range(frames):
         total = total + next_frame(bench).data
-        if report.due():
+        if report.is_due():
             yield report(done + 1)
     return (total / frames).astype(np.float32)
 

@@ -131,7 +131,7 @@ class OpenLoopAcquisition:
                     is_due = self._monitor is not None and self._monitor.is_due(self._n_processed)
                     if is_due and (yield from self._check_progress()):
                         return False
-                    if report.due():
+                    if report.is_due():
                         yield report(
                             done + 1, self._preview_arrays(preview), clipped_pokes=float(self.shortened)
                         )

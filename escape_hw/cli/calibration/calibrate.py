@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import shlex
 from dataclasses import replace
 from pathlib import Path
@@ -11,14 +10,12 @@ from typing import Annotated, Any
 import typer
 
 from escape_hw.cli import options
-from escape_hw.cli.calibration.display import show_calibration
 from escape_hw.cli.calibration.procedure_command import (
     option_name,
     procedure_options,
-    split_common,
-    with_signature,
 )
-from escape_hw.cli.context import CommandContext, command_context
+from escape_hw.cli.command import build_command, keyword
+from escape_hw.cli.context import CommandContext
 from escape_hw.errors import ConfigError, EscapeError
 from escape_hw.runtime.procedures.calibration import (
     CALIBRATIONS,
@@ -28,10 +25,6 @@ from escape_hw.runtime.procedures.calibration import (
 )
 from escape_hw.runtime.procedures.declaration import Parameter, present_names
 
-_System = Annotated[
-    str | None,
-    typer.Argument(help="Name of a system (see 'escape systems') or a TOML file; not with --resume."),
-]
 _Method = Annotated[str | None, typer.Option("--method", metavar="|".join(METHODS), help="Default: escape.")]
 _Modes = Annotated[
     int | None, typer.Option("--modes", min=1, help="Number of modes. Default: as configured.")
@@ -49,31 +42,30 @@ def _all_parameters() -> list[Parameter]:
     return sorted(found.values(), key=lambda one: one.last)
 
 
-def _calibrate(arguments: dict[str, Any]) -> None:
-    own, common = split_common(arguments)
-    system, modes, method = arguments["system"], own.pop("modes"), own.pop("method")
-    with command_context("calibrate", json=common["json"], quiet=common["quiet"]) as context:
-        request = _request(method, own)
-        selection = options.SystemSelection.of(
-            _system_or_run(system, request.resume), common["set"], common["seed"], common["mode"]
-        )
-        if modes is not None:
-            selection = _with_modes(context, selection, modes)
-        try:
-            context.run_procedure(request, selection, common["out"], show_calibration, request.resume)
-        except (EscapeError, KeyboardInterrupt) as error:
-            _suggest_resume(context, error, request)
-            raise
+def _calibrate(
+    context: CommandContext,
+    selection: options.SystemSelection,
+    method: str | None,
+    modes: int | None,
+    out: Path | None,
+    **arguments: Any,
+) -> None:
+    request = _request(method, arguments)
+    if not selection.system:
+        if request.resume is None:
+            raise ConfigError("which system? Name one (see 'escape systems'), or a run with --resume")
+        selection = replace(selection, system=str(request.resume / "config.toml"))
+    if modes is not None:
+        selection = _with_modes(context, selection, modes)
+    try:
+        context.run_procedure(request, selection, out, request.resume)
+    except (EscapeError, KeyboardInterrupt) as error:
+        _suggest_resume(context, error, request)
+        raise
 
 
 def _request(method: str | None, arguments: dict[str, Any]) -> CalibrationProcedure:
-    """The request of the method that is given, or of the run to resume.
-
-    Raises
-    ------
-    ConfigError
-        The method is unknown or does not have one of the given options.
-    """
+    """The request of the method that is given, or of the run to resume."""
     if method is None:
         resume = arguments["resume"]
         method = "escape" if resume is None else str(saved_request(resume)["method"])
@@ -105,15 +97,6 @@ def _suggest_resume(context: CommandContext, error: BaseException, request: Cali
         error.add_note(f"go on with: {shlex.join(words)}")
 
 
-def _system_or_run(system: str | None, resume: Path | None) -> str:
-    """The given system, or the configuration of the run to resume."""
-    if system is not None:
-        return system
-    if resume is None:
-        raise ConfigError("which system? Name one (see 'escape systems'), or a run with --resume")
-    return str(resume / "config.toml")
-
-
 def _with_modes(
     context: CommandContext, selection: options.SystemSelection, modes: int
 ) -> options.SystemSelection:
@@ -132,18 +115,16 @@ def _with_modes(
     return selection.with_overrides(f"basis.n_modes={modes}", f"loop.dropped_modes={dropped}")
 
 
-def _parameter(name: str, annotation: Any) -> inspect.Parameter:
-    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=annotation)
-
-
-calibrate = with_signature(
+calibrate = build_command(
     _calibrate,
-    [
-        _parameter("system", _System),
-        _parameter("method", _Method),
-        _parameter("modes", _Modes),
-        *procedure_options(_all_parameters(), optional=True),
-    ],
     "calibrate",
-    "Measure an interaction matrix and, with ESCAPE, the registration behind it.",
+    [
+        keyword("selection", options.OptionalSelection, options.NO_SYSTEM),
+        keyword("method", _Method, None),
+        keyword("modes", _Modes, None),
+        *procedure_options(_all_parameters(), optional=True),
+        keyword("out", options.Out, None),
+    ],
+    help="Measure an interaction matrix and, with ESCAPE, the registration behind it.",
+    quiet=True,
 )

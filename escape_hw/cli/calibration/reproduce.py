@@ -9,109 +9,88 @@ from typing import Annotated, Any
 import typer
 
 from escape_hw.cli import options
-from escape_hw.cli.context import CommandContext, command_context
+from escape_hw.cli.command import command
+from escape_hw.cli.context import CommandContext
+from escape_hw.cli.options import SystemSelection
 
 app = typer.Typer(help="The paper's tables and figures in simulation, with a report.", no_args_is_help=True)
-_SYSTEM = "razor-shwfs"
-_SystemOption = Annotated[str, typer.Option("--system", help="System to run on.")]
+_System = Annotated[SystemSelection, typer.Option("--system", help="System to run on.")]
+_SHWFS, _PYWFS, _MAPS = map(SystemSelection, ("razor-shwfs", "razor-pywfs", "maps-nir"))
+_LoopFrames = Annotated[int, typer.Option("--loop-frames", min=1, help="Frames of each loop.")]
+_DocrimeFrames = Annotated[int, typer.Option("--frames", min=1, help="Frames of the DO-CRIME run.")]
 
 
 @app.command("shwfs")
+@command("reproduce shwfs", quiet=True)
 def shwfs(
-    system: _SystemOption = _SYSTEM,
-    frames: Annotated[int, typer.Option("--frames", min=1, help="Frames of the DO-CRIME run.")] = 10_000,
-    loop_frames: Annotated[int, typer.Option("--loop-frames", min=1, help="Frames of each loop.")] = 30_000,
+    context: CommandContext,
+    selection: _System = _SHWFS,
+    frames: _DocrimeFrames = 10_000,
+    loop_frames: _LoopFrames = 30_000,
     realisations: Annotated[
         int,
         typer.Option("--realisations", min=0, help="Random registrations for the curve of error and frames."),
     ] = 4,
     out: options.Out = None,
-    set: options.Set = None,
-    seed: options.Seed = None,
-    mode: options.Mode = None,
-    json: options.Json = False,
-    quiet: options.Quiet = False,
 ) -> None:
     """Calibrate with and without a source, close the loop with every matrix, compare."""
-    with command_context("reproduce shwfs", json=json, quiet=quiet) as context:
-        counts = {"frames": frames, "loop_frames": loop_frames, "realisations": realisations}
-        result, document = _run_case(
-            context, "shwfs", counts, options.SystemSelection.of(system, set, seed, mode), out
-        )
-        _show_comparison(context, result, document)
+    counts = {"frames": frames, "loop_frames": loop_frames, "realisations": realisations}
+    _show_comparison(context, *_run_case(context, "shwfs", counts, selection, out))
 
 
 @app.command("pywfs")
+@command("reproduce pywfs", quiet=True)
 def pywfs(
-    system: Annotated[str, typer.Option("--system", help="System to run on.")] = "razor-pywfs",
+    context: CommandContext,
+    selection: _System = _PYWFS,
     frames: Annotated[
         int, typer.Option("--frames", min=1, help="Frames of the open-loop DO-CRIME.")
     ] = 100_000,
     closed_frames: Annotated[
         int, typer.Option("--closed-frames", min=1, help="Frames of each round in closed loop, at most.")
     ] = 20_000,
-    loop_frames: Annotated[int, typer.Option("--loop-frames", min=1, help="Frames of each loop.")] = 20_000,
+    loop_frames: _LoopFrames = 20_000,
     out: options.Out = None,
-    set: options.Set = None,
-    seed: options.Seed = None,
-    mode: options.Mode = None,
-    json: options.Json = False,
-    quiet: options.Quiet = False,
 ) -> None:
     """Matrices, optical gains and loops with and without them, on the pyramid bench."""
-    with command_context("reproduce pywfs", json=json, quiet=quiet) as context:
-        counts = {"frames": frames, "closed_frames": closed_frames, "loop_frames": loop_frames}
-        result, document = _run_case(
-            context, "pywfs", counts, options.SystemSelection.of(system, set, seed, mode), out
-        )
-        _show_comparison(context, result, document)
+    counts = {"frames": frames, "closed_frames": closed_frames, "loop_frames": loop_frames}
+    _show_comparison(context, *_run_case(context, "pywfs", counts, selection, out))
 
 
 @app.command("maps")
+@command("reproduce maps", quiet=True)
 def maps(
-    system: Annotated[str, typer.Option("--system", help="System to run on.")] = "maps-nir",
-    frames: Annotated[int, typer.Option("--frames", min=1, help="Frames of the DO-CRIME run.")] = 60_000,
-    loop_frames: Annotated[int, typer.Option("--loop-frames", min=1, help="Frames of each loop.")] = 10_000,
+    context: CommandContext,
+    selection: _System = _MAPS,
+    frames: _DocrimeFrames = 60_000,
+    loop_frames: _LoopFrames = 10_000,
     out: options.Out = None,
-    set: options.Set = None,
-    seed: options.Seed = None,
-    mode: options.Mode = None,
-    json: options.Json = False,
-    quiet: options.Quiet = False,
 ) -> None:
     """Measured matrix beside its simulation, and loops on the sky, with a contaminated mirror."""
-    with command_context("reproduce maps", json=json, quiet=quiet) as context:
-        counts = {"frames": frames, "loop_frames": loop_frames}
-        result, document = _run_case(
-            context, "maps", counts, options.SystemSelection.of(system, set, seed, mode), out
-        )
-        _show_comparison(context, result, document)
+    counts = {"frames": frames, "loop_frames": loop_frames}
+    _show_comparison(context, *_run_case(context, "maps", counts, selection, out))
 
 
 @app.command("table1")
+@command("reproduce table1", quiet=True)
 def table1(
-    system: _SystemOption = _SYSTEM,
+    context: CommandContext,
+    selection: _System = _SHWFS,
     short: Annotated[int, typer.Option("--short", min=1, help="Frames of the SHORT run.")] = 10_000,
     long: Annotated[int, typer.Option("--long", min=1, help="Frames of the LONG run.")] = 100_000,
     out: options.Out = None,
-    set: options.Set = None,
-    seed: options.Seed = None,
-    mode: options.Mode = None,
-    json: options.Json = False,
-    quiet: options.Quiet = False,
 ) -> None:
     """Registration from 20 seconds and from 3 minutes of data (paper, Table 1)."""
-    with command_context("reproduce table1", json=json, quiet=quiet) as context:
-        counts = {"short": short, "long": long}
-        result, document = _run_case(
-            context, "table1", counts, options.SystemSelection.of(system, set, seed, mode), out
-        )
-        _show_registration(context, result.calibrations, document)
-        _show_criteria(context, document)
+    counts = {"short": short, "long": long}
+    result, document = _run_case(context, "table1", counts, selection, out)
+    _show_registration(context, result.calibrations, document)
+    _show_criteria(context, document)
 
 
 @app.command("all")
+@command("reproduce all", quiet=True)
 def reproduce_all(
+    context: CommandContext,
     out: Annotated[Path, typer.Option("--out", help="Folder with one folder for each part.")],
     only: Annotated[
         list[str] | None, typer.Option("--only", help="A part (table1, shwfs, pywfs, maps); repeatable.")
@@ -131,97 +110,85 @@ def reproduce_all(
     ] = False,
     set: options.Set = None,
     seed: options.Seed = None,
-    json: options.Json = False,
-    quiet: options.Quiet = False,
 ) -> None:
     """Every table and figure, and a page with links to their reports."""
-    with command_context("reproduce all", json=json, quiet=quiet) as context:
-        from escape_hw.cli.formatting import format_criteria
-        from escape_hw.config.loader import load_system
-        from escape_hw.io import documents
-        from escape_hw.paper.cases import (
-            check_share,
-            find_sweeps,
-            load_finished,
-            request_fields,
-            select_cases,
-        )
-        from escape_hw.paper.results import write_index, write_results
+    from escape_hw.cli.formatting import format_criteria
+    from escape_hw.config.loader import load_system
+    from escape_hw.paper.cases import (
+        check_share,
+        find_sweeps,
+        load_finished,
+        request_fields,
+        select_cases,
+    )
+    from escape_hw.paper.results import write_index, write_results
 
-        parts: dict[str, Any] = {}
-        sweep_folders = find_sweeps(sweeps or [])
-        done = {
-            case.kind: load_finished(
-                out / case.kind, case.kind, request_fields(case.scaled_frames(share), set, seed)
-            )
-            if resume
-            else None
-            for case in select_cases(only)
-        }
-        remaining = [case for case in select_cases(only) if done[case.kind] is None]
-        choices = {case.kind: options.SystemSelection.of(case.system, set, seed, None) for case in remaining}
-        check_share(
-            [(case, load_system(case.system, overrides=set or [], seed=seed)) for case in remaining], share
+    parts: dict[str, Any] = {}
+    sweep_folders = find_sweeps(sweeps or [])
+    done = {
+        case.kind: load_finished(
+            out / case.kind, case.kind, request_fields(case.scaled_frames(share), set, seed)
         )
-        try:
-            for case in select_cases(only):
-                context.notify(f"{case.kind}: {case.title}")
-                saved_part = done[case.kind]
-                if saved_part is None:
-                    counts = case.scaled_frames(share)
-                    _, saved_part = _run_case(context, case.kind, counts, choices[case.kind], out / case.kind)
-                else:
-                    context.notify(f"{case.kind}: finished {saved_part['finished_utc']}, not run again")
-                parts[case.kind] = saved_part
-                context.show(*format_criteria(parts[case.kind]["criteria"]))
-        finally:
-            if parts:
-                context.show(f"index: {write_index(out, parts)}")
-                folders = {kind: Path(part["folder"]) for kind, part in parts.items()}
-                context.show(f"results: {write_results(out, {**folders, **sweep_folders})}")
-        met = all(check["met"] for part in parts.values() for check in part["criteria"])
-        simulated = any(part["simulated"] for part in parts.values())
-        header_fields = documents.header_fields("reproduce all", None, simulated, seed)
-        context.result(
-            {**header_fields, "parts": parts, "index": str(out.absolute() / "index.html")}, met=met
-        )
+        if resume
+        else None
+        for case in select_cases(only)
+    }
+    remaining = [case for case in select_cases(only) if done[case.kind] is None]
+    check_share(
+        [(case, load_system(case.system, overrides=set or [], seed=seed)) for case in remaining], share
+    )
+    try:
+        for case in select_cases(only):
+            context.notify(f"{case.kind}: {case.title}")
+            saved_part = done[case.kind]
+            if saved_part is None:
+                selection = SystemSelection(case.system, tuple(set or ()), seed)
+                counts = case.scaled_frames(share)
+                _, saved_part = _run_case(context, case.kind, counts, selection, out / case.kind)
+            else:
+                context.notify(f"{case.kind}: finished {saved_part['finished_utc']}, not run again")
+            parts[case.kind] = saved_part
+            context.show(*format_criteria(parts[case.kind]["criteria"]))
+    finally:
+        if parts:
+            context.show(f"index: {write_index(out, parts)}")
+            folders = {kind: Path(part["folder"]) for kind, part in parts.items()}
+            context.show(f"results: {write_results(out, {**folders, **sweep_folders})}")
+    met = all(check["met"] for part in parts.values() for check in part["criteria"])
+    simulated = any(part["simulated"] for part in parts.values())
+    context.set_subject(None, simulated, seed)
+    context.report(met=met, parts=parts, index=str(out.absolute() / "index.html"))
 
 
 @app.command("sky-time")
+@command("reproduce sky-time", quiet=True, without=("seed", "mode"))
 def sky_time(
-    system: _SystemOption = _SYSTEM,
+    context: CommandContext,
+    selection: _System = _SHWFS,
     realisations: Annotated[int, typer.Option("--realisations", min=2, help="Random registrations.")] = 20,
     frames: Annotated[
         list[int] | None, typer.Option("--frames", min=1, help="Frames at which to estimate; repeatable.")
     ] = None,
     workers: Annotated[int, typer.Option("--workers", min=1, help="Parallel processes.")] = 2,
-    set: options.Set = None,
-    json: options.Json = False,
-    quiet: options.Quiet = False,
 ) -> None:
     """Error of the registration against frames, by estimator, with the Cramer-Rao bound."""
-    with command_context("reproduce sky-time", json=json, quiet=quiet) as context:
-        from escape_hw.io import documents
-        from escape_hw.paper import sky_time as campaign
+    from escape_hw.paper import sky_time as campaign
 
-        config = context.load_config(options.SystemSelection.of(system, set, None, "sim"))
-        counts = sorted(frames or campaign.FRAMES)
-        procedure = campaign.sky_time(
-            system, realisations=realisations, frames=counts, overrides=set or [], workers=workers
-        )
-        curves, stop = context.run_keeping_partial(procedure)
-        header_fields = documents.header_fields(
-            "reproduce sky-time", config.system.name, True, config.system.seed
-        )
-        context.show(_curves_table(campaign.table_rows(curves)))
-        least = ", ".join(f"{name}: {n or 'none of these'}" for name, n in curves["fewest_frames"].items())
-        context.show(f"fewest frames that meet the goal in every parameter: {least}")
-        if "note" in curves:
-            context.notify(curves["note"])
-        met = "note" not in curves and curves["fewest_frames"]["telemetry"] is not None
-        context.result({**header_fields, **curves}, met=met)
-        if stop is not None:
-            raise stop
+    context.load_config(replace(selection, mode="sim"))
+    procedure = campaign.sky_time(
+        selection.system, realisations=realisations, frames=sorted(frames or campaign.FRAMES),
+        overrides=selection.set, workers=workers,
+    )  # fmt: skip
+    curves, stop = context.run_keeping_partial(procedure)
+    context.show(_curves_table(campaign.table_rows(curves)))
+    least = ", ".join(f"{name}: {n or 'none of these'}" for name, n in curves["fewest_frames"].items())
+    context.show(f"fewest frames that meet the goal in every parameter: {least}")
+    if "note" in curves:
+        context.notify(curves["note"])
+    met = "note" not in curves and curves["fewest_frames"]["telemetry"] is not None
+    context.report(**{"simulated": True, **curves}, met=met)
+    if stop is not None:
+        raise stop
 
 
 def _curves_table(rows: Any) -> Any:
@@ -239,7 +206,7 @@ def _run_case(
     context: CommandContext,
     kind: str,
     counts: dict[str, int],
-    selection: options.SystemSelection,
+    selection: SystemSelection,
     out: Path | None,
 ) -> tuple[Any, dict[str, Any]]:
     """Run a case and save its result, also a partial one; the user's overrides follow those of the case."""

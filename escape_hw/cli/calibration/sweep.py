@@ -4,24 +4,24 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from escape_hw.cli import options
-from escape_hw.cli.context import CommandContext, command_context
+from escape_hw.cli.command import command
+from escape_hw.cli.context import CommandContext
+from escape_hw.errors import ConfigError
 
 if TYPE_CHECKING:
     from escape_hw.bench import Bench
-    from escape_hw.errors import Aborted
     from escape_hw.io.run_folder import RunFolder
     from escape_hw.runtime.session.record import BenchRecord
     from escape_hw.runtime.sweep.description import SweepDescription
     from escape_hw.runtime.sweep.design import MatrixVariant
     from escape_hw.runtime.sweep.result import SweepResult
-    from escape_hw.runtime.sweep.workers import Workers
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,11 +38,10 @@ class _Request:
     force: bool
 
 
+@command("sweep", quiet=True)
 def sweep(
-    system: Annotated[
-        str | None,
-        typer.Argument(help="Name of a system (see 'escape systems') or a TOML file; not with --resume."),
-    ] = None,
+    context: CommandContext,
+    selection: options.OptionalSelection = options.NO_SYSTEM,
     im: Annotated[
         list[Path] | None,
         typer.Option(
@@ -111,58 +110,52 @@ def sweep(
     ] = None,
     force: options.Force = False,
     out: options.Out = None,
-    set: options.Set = None,
-    seed: options.Seed = None,
-    mode: options.Mode = None,
-    json: options.Json = False,
-    quiet: options.Quiet = False,
 ) -> None:
     """Compare matrices, each at its own best gain, leak and number of modes, on the same turbulence."""
-    with command_context("sweep", json=json, quiet=quiet) as context:
-        from escape_hw.errors import ConfigError
-        from escape_hw.runtime.sweep.request import parse_search_space, require_loop_frames, require_optuna
+    from escape_hw.runtime.sweep.request import parse_search_space, require_loop_frames, require_optuna
 
-        require_optuna()
-        if (system is None) == (resume is None):
-            raise ConfigError("name a system (see 'escape systems') or a run with --resume, one of the two")
-        ranges = {"gain": gain, "leak": leak, "dropped_modes": dropped_modes, "delay": delay}
-        request = _Request(
-            tuple(im or ()), gains,
-            (*(f"{key}={text}" for key, text in ranges.items() if text is not None), *(vary or ())),
-            (trials, candidates, replicates, final_replicates),
-            frames, calibration_frames,
-            dict(sampler=sampler, metric=metric, margin=margin / 100, storage=storage, study=study),
-            force,
-        )  # fmt: skip
-        source = str(system if resume is None else resume / "config.toml")
-        selection = options.SystemSelection.of(source, set, seed, mode)
-        config = context.load_config(selection)
-        resumed = None
-        if resume is None:
-            parse_search_space(config, request.vary)
-            require_loop_frames(config, frames)
-        else:
-            from escape_hw.runtime.sweep.description import read_description
+    require_optuna()
+    if bool(selection.system) == bool(resume):
+        raise ConfigError("name a system (see 'escape systems') or a run with --resume, one of the two")
+    ranges = {"gain": gain, "leak": leak, "dropped_modes": dropped_modes, "delay": delay}
+    request = _Request(
+        tuple(im or ()), gains,
+        (*(f"{key}={text}" for key, text in ranges.items() if text is not None), *(vary or ())),
+        (trials, candidates, replicates, final_replicates),
+        frames, calibration_frames,
+        dict(sampler=sampler, metric=metric, margin=margin / 100, storage=storage, study=study),
+        force,
+    )  # fmt: skip
+    if resume is not None:
+        selection = replace(selection, system=str(resume / "config.toml"))
+    config = context.load_config(selection)
+    resumed = None
+    if resume is None:
+        parse_search_space(config, request.vary)
+        require_loop_frames(config, frames)
+    else:
+        from escape_hw.runtime.sweep.description import read_description
 
-            resumed = read_description(resume, storage)
-            if _show_finished(context, resume, resumed):
-                return
-        with context.run_folder(config, "sweep", out) as folder:
-            with context.bench(selection) as bench:
-                from escape_hw.runtime.session.record import BenchRecord
+        resumed = read_description(resume, storage)
+        if _show_finished(context, resume, resumed):
+            return
+    with context.run_folder(config, "sweep", out) as folder:
+        from escape_hw.runtime.session.record import BenchRecord
+        from escape_hw.runtime.sweep.result import sweep_and_analyse
+        from escape_hw.runtime.sweep.workers import open_workers
 
-                record = BenchRecord.from_bench(bench)
-                description = resumed or _describe(context, request, bench, folder, record)
-                if not bench.simulated:
-                    result, stop = _run(context, description, bench)
-            if description.sweep.simulated:
-                from escape_hw.runtime.sweep.workers import open_workers
-
-                result, stop = _run(context, description, open_workers(workers, scheduler))
-            with context.protect_saving(stop):
-                _save(context, folder, record, description, result)
-            if stop is not None:
-                raise stop
+        with context.bench(selection) as bench:
+            record = BenchRecord.from_bench(bench)
+            description = resumed or _describe(context, request, bench, folder, record)
+            if not bench.simulated:
+                result, stop = context.run_keeping_partial(sweep_and_analyse(description, bench))
+        if description.sweep.simulated:
+            pool = open_workers(workers, scheduler)
+            result, stop = context.run_keeping_partial(sweep_and_analyse(description, pool))
+        with context.protect_saving(stop):
+            _save(context, folder, record, description, result)
+        if stop is not None:
+            raise stop
 
 
 def _show_finished(context: CommandContext, run: Path, description: SweepDescription) -> bool:
@@ -200,7 +193,6 @@ def _describe(
 def _prepare_variants(
     context: CommandContext, request: _Request, bench: Bench, folder: RunFolder, record: BenchRecord
 ) -> list[MatrixVariant]:
-    from escape_hw.errors import ConfigError
     from escape_hw.io.fits.gains import load_gains
     from escape_hw.runtime.procedures.matrix_input import load_fitting_matrix, require_hardware_matrix
     from escape_hw.runtime.sweep.matrices import measure_variants, read_variants, save_variants
@@ -218,22 +210,6 @@ def _prepare_variants(
     pyramid = config.sensor.kind == "pyramid"
     measured = context.run(measure_variants(bench, frames=frames, gain_frames=frames if pyramid else 0))
     return save_variants(folder, record, measured)
-
-
-def _run(
-    context: CommandContext, description: SweepDescription, runner: Workers | Bench
-) -> tuple[SweepResult, Aborted | None]:
-    from escape_hw.bench import Bench
-    from escape_hw.runtime.sweep.result import analyse_sweep
-    from escape_hw.runtime.sweep.run import run_sweep
-
-    try:
-        procedure = run_sweep(description.open_study(), runner)
-        found, stop = context.run_keeping_partial(procedure)
-    finally:
-        if not isinstance(runner, Bench):
-            runner.close()
-    return analyse_sweep(description.sweep, found, description.margin), stop
 
 
 def _save(

@@ -9,13 +9,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from escape_hw.cli import options
-from escape_hw.cli.context import CommandContext, command_context
-from escape_hw.cli.devices.device_tools import (
-    announce_change,
-    build_single_device,
-    open_device,
-    report_device_result,
-)
+from escape_hw.cli.command import command
+from escape_hw.cli.context import CommandContext
+from escape_hw.cli.devices.device_tools import announce_change, build_single_device
+from escape_hw.errors import ConfigError
 
 if TYPE_CHECKING:
     from escape_hw.api.adaptive_secondary import AdaptiveSecondary, ShellHealth
@@ -27,97 +24,64 @@ app = typer.Typer(
 
 
 @app.command("status")
-def status(
-    system: options.System,
-    set: options.Set = None,
-    seed: options.Seed = None,
-    mode: options.Mode = None,
-    json: options.Json = False,
-) -> None:
+@command("asm status")
+def status(context: CommandContext, selection: options.Selection) -> None:
     """Show state and health; takes no control and moves nothing."""
-    with command_context("asm status", json=json) as context:
-        config, mirror = _secondary(context, options.SystemSelection.of(system, set, seed, mode))
-        context.devices_opened = True
-        health = mirror.observe_health()
-        info = mirror.info
-        context.show(f"{info.model} {info.serial}", *_format_health(health))
-        report_device_result(
-            context, "asm status", config, info.simulated, False,
-            model=info.model, serial=info.serial, **asdict(health),
-        )  # fmt: skip
+    _, mirror = _secondary(context, selection)
+    context.devices_opened = True
+    health = mirror.observe_health()
+    info = mirror.info
+    context.show(f"{info.model} {info.serial}", *_format_health(health))
+    context.report(
+        simulated=info.simulated, changed=False, model=info.model, serial=info.serial, **asdict(health)
+    )
 
 
 @app.command("set")
-def set_(
-    system: options.System,
-    set: options.Set = None,
-    seed: options.Seed = None,
-    mode: options.Mode = None,
-    json: options.Json = False,
-) -> None:
+@command("asm set")
+def set_(context: CommandContext, selection: options.Selection) -> None:
     """Float the shell, flat: MOVES it. It stays afloat under its own control after the command."""
-    with command_context("asm set", json=json) as context:
-        _go_to_state(context, options.SystemSelection.of(system, set, seed, mode), "asm set", floating=True)
+    _go_to_state(context, selection, floating=True)
 
 
 @app.command("rest")
-def rest(
-    system: options.System,
-    set: options.Set = None,
-    seed: options.Seed = None,
-    mode: options.Mode = None,
-    json: options.Json = False,
-) -> None:
+@command("asm rest")
+def rest(context: CommandContext, selection: options.Selection) -> None:
     """Lay the shell on its reference body: MOVES it."""
-    with command_context("asm rest", json=json) as context:
-        _go_to_state(context, options.SystemSelection.of(system, set, seed, mode), "asm rest", floating=False)
+    _go_to_state(context, selection, floating=False)
 
 
 @app.command("clear")
+@command("asm clear")
 def clear(
-    system: options.System,
+    context: CommandContext,
+    selection: options.Selection,
     yes: Annotated[bool, typer.Option("--yes", help="The cause is fixed; do not ask.")] = False,
-    set: options.Set = None,
-    seed: options.Seed = None,
-    mode: options.Mode = None,
-    json: options.Json = False,
 ) -> None:
     """Clear a latched fault after its cause is fixed; the shell is at rest afterwards."""
-    with command_context("asm clear", json=json) as context:
-        from escape_hw.errors import ConfigError
-
-        config, mirror = _secondary(context, options.SystemSelection.of(system, set, seed, mode))
-        context.devices_opened = True
-        previous = mirror.observe_health()
-        if previous.state == "fault" and not yes:
-            context.notify(f"fault: {previous.fault}")
-            if json or not sys.stdin.isatty() or not typer.confirm("Is its cause fixed?", err=True):
-                raise ConfigError("the fault was not cleared; fix its cause, then confirm with --yes")
-        if previous.state == "fault":
-            announce_change(context, config, "dm", f"clear the fault '{previous.fault}'")
-            with open_device(context, mirror):
-                mirror.recover()
-                after = mirror.health
-        else:
-            after = previous
-        context.show(f"fault: {previous.fault or 'none'}; now {after.state}")
-        changed = after is not previous
-        report_device_result(
-            context, "asm clear", config, mirror.info.simulated, changed,
-            before=previous.state, fault=previous.fault, after=after.state,
-        )  # fmt: skip
+    config, mirror = _secondary(context, selection)
+    context.devices_opened = True
+    previous = after = mirror.observe_health()
+    if previous.state == "fault" and not yes:
+        context.notify(f"fault: {previous.fault}")
+        if context.json or not sys.stdin.isatty() or not typer.confirm("Is its cause fixed?", err=True):
+            raise ConfigError("the fault was not cleared; fix its cause, then confirm with --yes")
+    if previous.state == "fault":
+        announce_change(context, config, "dm", f"clear the fault '{previous.fault}'")
+        with context.opened(mirror):
+            mirror.recover()
+            after = mirror.health
+    context.show(f"fault: {previous.fault or 'none'}; now {after.state}")
+    context.report(
+        simulated=mirror.info.simulated, changed=after is not previous, before=previous.state,
+        fault=previous.fault, after=after.state,
+    )  # fmt: skip
 
 
 def _secondary(
     context: CommandContext, selection: options.SystemSelection
 ) -> tuple[SystemConfig, AdaptiveSecondary]:
-    """The system's adaptive secondary, not open.
-
-    Raises
-    ------
-    ConfigError
-        The mirror is no adaptive secondary.
-    """
+    """The system's adaptive secondary, not open."""
     from escape_hw.api.adaptive_secondary import AdaptiveSecondary
 
     config, mirror = build_single_device(context, selection, "dm", AdaptiveSecondary)  # type: ignore[type-abstract]
@@ -126,9 +90,7 @@ def _secondary(
     return config, mirror
 
 
-def _go_to_state(
-    context: CommandContext, selection: options.SystemSelection, command: str, *, floating: bool
-) -> None:
+def _go_to_state(context: CommandContext, selection: options.SystemSelection, *, floating: bool) -> None:
     """Bring the mirror to a state and leave it there."""
     from escape_hw.api.adaptive_secondary import ShellState
 
@@ -138,13 +100,13 @@ def _go_to_state(
     previous = mirror.observe_health().state
     announce_change(context, config, "dm", f"from {previous} to {requested}")
     mirror.leave_set = floating
-    with open_device(context, mirror):
+    with context.opened(mirror):
         mirror.go_to(requested)
         health = mirror.health
     context.show(f"{previous} → {health.state}", *_format_health(health))
-    report_device_result(
-        context, command, config, mirror.info.simulated, previous is not health.state,
-        before=previous, after=health.state, health=asdict(health),
+    context.report(
+        simulated=mirror.info.simulated, changed=previous is not health.state, before=previous,
+        after=health.state, health=asdict(health),
     )  # fmt: skip
 
 

@@ -9,13 +9,10 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from escape_hw.cli import options
-from escape_hw.cli.context import CommandContext, command_context
-from escape_hw.cli.devices.device_tools import (
-    announce_change,
-    build_single_device,
-    open_device,
-    report_device_result,
-)
+from escape_hw.cli.command import command
+from escape_hw.cli.context import CommandContext
+from escape_hw.cli.devices.device_tools import announce_change, build_single_device
+from escape_hw.errors import ConfigError
 
 if TYPE_CHECKING:
     from escape_hw.api.camera import Camera, CameraInfo, CameraSettings, Frame
@@ -31,92 +28,81 @@ Which = Annotated[
 
 
 @app.command("snap")
+@command("camera snap", quiet=True)
 def snap(
-    system: options.System,
+    context: CommandContext,
+    selection: options.Selection,
     camera: Which = "wfs",
     frames: Annotated[int, typer.Option("--frames", min=1, max=100000, help="Number of frames.")] = 1,
     out: Annotated[
         Path | None, typer.Option("--out", metavar="FILE", help="FITS file (default: nothing is written).")
     ] = None,
-    set: options.Set = None,
-    seed: options.Seed = None,
-    mode: options.Mode = None,
-    json: options.Json = False,
-    quiet: options.Quiet = False,
 ) -> None:
     """Record frames with the settings of the configuration."""
-    with command_context("camera snap", json=json, quiet=quiet) as context:
-        import numpy as np
+    import numpy as np
 
-        from escape_hw.errors import ConfigError
-        from escape_hw.runtime.host.device_tools import grab_frames
+    from escape_hw.runtime.host.device_tools import grab_frames
 
-        config, section, device = _camera(
-            context, options.SystemSelection.of(system, set, seed, mode), camera
-        )
-        if out is not None and out.exists():
-            raise ConfigError(f"{out}: exists; choose another name or remove it")
-        with open_device(context, device):
-            settings, changed = _apply_configuration(context, config, camera, device)
-            frame_list = context.run(grab_frames(device, frames, section.timeout_s))
-            info, status = device.info, device.status()
-        if out is not None:
-            _save(out, frame_list, info, settings, config)
-        cube = np.stack([frame.data for frame in frame_list])
-        counts = {"min": int(cube.min()), "max": int(cube.max()), "mean": float(cube.mean())}
-        saturated = max(frame.n_saturated for frame in frame_list)
-        context.show(
-            f"{info.model} {info.serial}: {len(frame_list)} frames of {cube.shape[2]} x {cube.shape[1]} "
-            f"pixels, {status.lost} lost, counts {counts['min']} to {counts['max']}, "
-            f"mean {counts['mean']:.1f}, {saturated} saturated",
-            *([f"written: {out}"] if out is not None else []),
-        )
-        report_device_result(
-            context, "camera snap", config, info.simulated, changed, camera=camera, frames=len(frame_list),
-            shape=cube.shape[1:], counts=counts, saturated=saturated, lost=status.lost,
-            first_index=frame_list[0].index, settings=asdict(settings), file=out,
-        )  # fmt: skip
+    config, section, device = _camera(context, selection, camera)
+    if out is not None and out.exists():
+        raise ConfigError(f"{out}: exists; choose another name or remove it")
+    with context.opened(device):
+        settings, changed = _apply_configuration(context, config, camera, device)
+        frame_list = context.run(grab_frames(device, frames, section.timeout_s))
+        info, status = device.info, device.status()
+    if out is not None:
+        _save(out, frame_list, info, settings, config)
+    cube = np.stack([frame.data for frame in frame_list])
+    counts = {"min": int(cube.min()), "max": int(cube.max()), "mean": float(cube.mean())}
+    saturated = max(frame.n_saturated for frame in frame_list)
+    context.show(
+        f"{info.model} {info.serial}: {len(frame_list)} frames of {cube.shape[2]} x {cube.shape[1]} "
+        f"pixels, {status.lost} lost, counts {counts['min']} to {counts['max']}, "
+        f"mean {counts['mean']:.1f}, {saturated} saturated",
+        *([f"written: {out}"] if out is not None else []),
+    )
+    context.report(
+        simulated=info.simulated, changed=changed, camera=camera, frames=len(frame_list),
+        shape=cube.shape[1:], counts=counts, saturated=saturated, lost=status.lost,
+        first_index=frame_list[0].index, settings=asdict(settings), file=out,
+    )  # fmt: skip
 
 
 @app.command("stream")
+@command("camera stream", quiet=True)
 def stream(
-    system: options.System,
+    context: CommandContext,
+    selection: options.Selection,
     camera: Which = "wfs",
     seconds: Annotated[float, typer.Option("--seconds", min=0.01, max=86400, help="Duration.")] = 1.0,
-    set: options.Set = None,
-    seed: options.Seed = None,
-    mode: options.Mode = None,
-    json: options.Json = False,
-    quiet: options.Quiet = False,
 ) -> None:
     """Monitor a running camera: rate, lost frames, counts. Exit code 1 when frames were lost."""
-    with command_context("camera stream", json=json, quiet=quiet) as context:
-        from escape_hw.runtime.host.device_tools import monitor_camera
+    from escape_hw.runtime.host.device_tools import monitor_camera
 
-        config, section, device = _camera(
-            context, options.SystemSelection.of(system, set, seed, mode), camera
-        )
-        with open_device(context, device):
-            settings, changed = _apply_configuration(context, config, camera, device)
-            statistics = context.run(monitor_camera(device, seconds, section.timeout_s))
-            info = device.info
-        context.show(
-            f"{info.model} {info.serial}: {statistics.frames} frames at {statistics.rate_hz:.2f} Hz "
-            f"(requested {settings.frame_rate_hz:.2f}), {statistics.status.lost} lost, "
-            f"{statistics.status.timeouts} time-outs",
-            f"counts {statistics.lowest} to {statistics.highest}, mean {statistics.mean:.1f}, "
-            f"{statistics.saturated} saturated",
-        )
-        report_device_result(
-            context, "camera stream", config, info.simulated, changed,
-            camera=camera, settings=asdict(settings), **asdict(statistics),
-        )  # fmt: skip
-        context.code = context.code or int(statistics.status.lost > 0)
+    config, section, device = _camera(context, selection, camera)
+    with context.opened(device):
+        settings, changed = _apply_configuration(context, config, camera, device)
+        statistics = context.run(monitor_camera(device, seconds, section.timeout_s))
+        info = device.info
+    context.show(
+        f"{info.model} {info.serial}: {statistics.frames} frames at {statistics.rate_hz:.2f} Hz "
+        f"(requested {settings.frame_rate_hz:.2f}), {statistics.status.lost} lost, "
+        f"{statistics.status.timeouts} time-outs",
+        f"counts {statistics.lowest} to {statistics.highest}, mean {statistics.mean:.1f}, "
+        f"{statistics.saturated} saturated",
+    )
+    context.report(
+        simulated=info.simulated, changed=changed, camera=camera, settings=asdict(settings),
+        **asdict(statistics),
+    )  # fmt: skip
+    context.code = context.code or int(statistics.status.lost > 0)
 
 
 @app.command("settings")
+@command("camera settings")
 def settings(
-    system: options.System,
+    context: CommandContext,
+    selection: options.Selection,
     camera: Which = "wfs",
     exposure: Annotated[float | None, typer.Option("--exposure", help="Exposure time, seconds.")] = None,
     rate: Annotated[float | None, typer.Option("--frame-rate", help="Frames per second, hertz.")] = None,
@@ -127,30 +113,23 @@ def settings(
     check: Annotated[
         bool, typer.Option("--check", help="Only check what the camera can do; set nothing.")
     ] = False,
-    set: options.Set = None,
-    seed: options.Seed = None,
-    mode: options.Mode = None,
-    json: options.Json = False,
 ) -> None:
     """Check settings, then set them; shows the settings in force, as TOML to paste."""
-    with command_context("camera settings", json=json) as context:
-        config, section, device = _camera(
-            context, options.SystemSelection.of(system, set, seed, mode), camera
-        )
-        requested = _requested_settings(section.settings(), exposure, rate, gain, region)
-        if not check:
-            announce_change(context, config, camera, "exposure, frame rate, gain and region")
-        with open_device(context, device):
-            achievable = device.check(requested)
-            now = achievable if check else device.configure(requested)
-            info = device.info
-        context.show(f"[devices.{camera}]", *_format_toml(now))
-        if now != requested:
-            context.notify(f"requested: {requested}")
-        report_device_result(
-            context, "camera settings", config, info.simulated, not check,
-            camera=camera, asked=asdict(requested), settings=asdict(now), as_asked=now == requested,
-        )  # fmt: skip
+    config, section, device = _camera(context, selection, camera)
+    requested = _requested_settings(section.settings(), exposure, rate, gain, region)
+    if not check:
+        announce_change(context, config, camera, "exposure, frame rate, gain and region")
+    with context.opened(device):
+        achievable = device.check(requested)
+        now = achievable if check else device.configure(requested)
+        info = device.info
+    context.show(f"[devices.{camera}]", *_format_toml(now))
+    if now != requested:
+        context.notify(f"requested: {requested}")
+    context.report(
+        simulated=info.simulated, changed=not check, camera=camera, asked=asdict(requested),
+        settings=asdict(now), as_asked=now == requested,
+    )  # fmt: skip
 
 
 def _camera(
@@ -177,15 +156,8 @@ def _apply_configuration(
 def _requested_settings(
     base: CameraSettings, exposure: float | None, rate: float | None, gain: float | None, region: str | None
 ) -> CameraSettings:
-    """The configured settings with the options applied.
-
-    Raises
-    ------
-    ConfigError
-        The region is not four integers.
-    """
+    """The configured settings with the options applied."""
     from escape_hw.api.camera import Region
-    from escape_hw.errors import ConfigError
 
     if region is not None:
         parts = region.split(",")

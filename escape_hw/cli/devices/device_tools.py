@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 from escape_hw.cli.context import CommandContext
 from escape_hw.cli.options import SystemSelection
@@ -25,40 +23,10 @@ def announce_change(context: CommandContext, config: SystemConfig, key: str, wha
         context.notify(f"this changes hardware, devices.{key} {section.serial}: {what}")
 
 
-@contextmanager
-def open_device(context: CommandContext, device: D) -> Iterator[D]:
-    """Open a device, and close it at the end; a Ctrl-C does not interrupt the closing."""
-    context.devices_opened = True
-    try:
-        with device:
-            try:
-                yield device
-            finally:
-                context.interrupts.begin_closing()
-    finally:
-        context.interrupts.end_closing()
-
-
-def report_device_result(
-    context: CommandContext, command: str, config: SystemConfig, simulated: bool, changed: bool, **rest: Any
-) -> None:
-    """Set the command's document."""
-    from escape_hw.io.documents import header_fields
-
-    start = header_fields(command, config.system.name, simulated, config.system.seed)
-    context.result({**start, "changed": changed, **rest})
-
-
 def build_single_device(
     context: CommandContext, selection: SystemSelection, key: str, kind: type[D]
 ) -> tuple[SystemConfig, D]:
-    """Configuration and one device of a system, not open.
-
-    Raises
-    ------
-    ConfigError
-        Wrong configuration, or no such device.
-    """
+    """Configuration and one device of a system, not open."""
     from escape_hw.bench import build_device
 
     config = context.load_config(selection)

@@ -8,18 +8,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from escape_hw.cli import options
-from escape_hw.cli.context import CommandContext, command_context
-from escape_hw.cli.devices.device_tools import (
-    announce_change,
-    build_single_device,
-    open_device,
-    report_device_result,
-)
+from escape_hw.cli.command import command
+from escape_hw.cli.context import CommandContext
+from escape_hw.cli.devices.device_tools import announce_change, build_single_device
+from escape_hw.errors import ConfigError
 
 if TYPE_CHECKING:
     from escape_hw.api.mirror import DeformableMirror
     from escape_hw.config.system import SystemConfig
-    from escape_hw.runtime.host.device_tools import DriveResult
 
 app = typer.Typer(
     help="Flatten, poke or query the deformable mirror; simulated or real.", no_args_is_help=True
@@ -28,126 +24,103 @@ Seconds = Annotated[float, typer.Option("--seconds", min=0, max=3600, help="Dura
 
 
 @app.command("flat")
-def flat(
-    system: options.System,
-    set: options.Set = None,
-    seed: options.Seed = None,
-    mode: options.Mode = None,
-    json: options.Json = False,
-) -> None:
+@command("dm flat")
+def flat(context: CommandContext, selection: options.Selection) -> None:
     """Ramp to the flat shape: MOVES the mirror."""
-    with command_context("dm flat", json=json) as context:
-        config, dm = _mirror(context, options.SystemSelection.of(system, set, seed, mode))
-        announce_change(context, config, "dm", "ramp to flat")
-        _preserve_floating(dm)
-        with open_device(context, dm):
-            dm.flatten()
-            info, sent = dm.info, dm.sent_count
-        context.show(f"{info.model} {info.serial}: flat after {sent} commands")
-        report_device_result(context, "dm flat", config, info.simulated, True, commands=sent)
+    config, dm = _mirror(context, selection)
+    announce_change(context, config, "dm", "ramp to flat")
+    _preserve_floating(dm)
+    with context.opened(dm):
+        dm.flatten()
+        info, sent = dm.info, dm.sent_count
+    context.show(f"{info.model} {info.serial}: flat after {sent} commands")
+    context.report(simulated=info.simulated, changed=True, commands=sent)
 
 
 # Otherwise a negative amplitude is parsed as an option.
 @app.command("poke", context_settings={"ignore_unknown_options": True})
+@command("dm poke", quiet=True)
 def poke(
-    system: options.System,
+    context: CommandContext,
+    selection: options.Selection,
     actuator: Annotated[int, typer.Argument(min=0, help="Number of the actuator, counted from 0.")],
     amplitude: Annotated[float, typer.Argument(help="Fraction of full stroke, such as 0.05.")],
     seconds: Seconds = 1.0,
-    set: options.Set = None,
-    seed: options.Seed = None,
-    mode: options.Mode = None,
-    json: options.Json = False,
-    quiet: options.Quiet = False,
 ) -> None:
     """Poke one actuator for a while: MOVES the mirror, flat before and after."""
-    with command_context("dm poke", json=json, quiet=quiet) as context:
-        config, dm = _mirror(context, options.SystemSelection.of(system, set, seed, mode))
-        _require_actuator(config, actuator, amplitude)
-        from escape_hw.runtime.host.device_tools import hold_shape, poke_shape
+    config, dm = _mirror(context, selection)
+    _require_actuator(config, actuator, amplitude)
+    from escape_hw.runtime.host.device_tools import hold_shape, poke_shape
 
-        announce_change(
-            context, config, "dm", f"flat, then actuator {actuator} by {amplitude:g} for {seconds:g} s"
-        )
-        _preserve_floating(dm)
-        with open_device(context, dm):
-            dm.flatten()
-            motion = context.run(hold_shape(dm, poke_shape(dm, actuator, amplitude), seconds))
-            info = dm.info
-        asked = {"actuator": actuator, "amplitude": amplitude, "seconds": seconds}
-        context.show(f"{info.model} {info.serial}: actuator {actuator} by {amplitude:g}, then flat")
-        _report_motion(context, "dm poke", config, info.simulated, asked, motion)
+    announce_change(
+        context, config, "dm", f"flat, then actuator {actuator} by {amplitude:g} for {seconds:g} s"
+    )
+    _preserve_floating(dm)
+    with context.opened(dm):
+        dm.flatten()
+        motion = context.run(hold_shape(dm, poke_shape(dm, actuator, amplitude), seconds))
+        info = dm.info
+    asked = {"actuator": actuator, "amplitude": amplitude, "seconds": seconds}
+    context.show(f"{info.model} {info.serial}: actuator {actuator} by {amplitude:g}, then flat")
+    context.report(simulated=info.simulated, changed=True, asked=asked, **asdict(motion))
 
 
 @app.command("wave")
+@command("dm wave", quiet=True)
 def wave(
-    system: options.System,
+    context: CommandContext,
+    selection: options.Selection,
     amplitude: Annotated[float, typer.Option("--amplitude", min=0, max=1, help="Of full stroke.")] = 0.02,
     frequency: Annotated[float, typer.Option("--frequency", min=0.01, max=20, help="Hertz.")] = 0.5,
     waves: Annotated[float, typer.Option("--waves", min=0, max=20, help="Periods across.")] = 2.0,
     seconds: Seconds = 4.0,
-    set: options.Set = None,
-    seed: options.Seed = None,
-    mode: options.Mode = None,
-    json: options.Json = False,
-    quiet: options.Quiet = False,
 ) -> None:
     """Run a wave over the mirror: MOVES every actuator, flat before and after."""
-    with command_context("dm wave", json=json, quiet=quiet) as context:
-        from escape_hw.runtime.host.device_tools import run_wave, wave_generator
+    from escape_hw.runtime.host.device_tools import run_wave, wave_generator
 
-        config, dm = _mirror(context, options.SystemSelection.of(system, set, seed, mode))
-        announce_change(
-            context, config, "dm", f"a wave of {amplitude:g} at {frequency:g} Hz for {seconds:g} s"
-        )
-        _preserve_floating(dm)
-        with open_device(context, dm):
-            dm.flatten()
-            motion = context.run(run_wave(dm, wave_generator(dm, amplitude, waves), frequency, seconds))
-            info = dm.info
-        asked = {"amplitude": amplitude, "frequency_hz": frequency, "waves": waves, "seconds": seconds}
-        context.show(
-            f"{info.model} {info.serial}: {motion.commands} commands, largest {motion.peak:.4g}, then flat"
-        )
-        _report_motion(context, "dm wave", config, info.simulated, asked, motion)
+    config, dm = _mirror(context, selection)
+    announce_change(context, config, "dm", f"a wave of {amplitude:g} at {frequency:g} Hz for {seconds:g} s")
+    _preserve_floating(dm)
+    with context.opened(dm):
+        dm.flatten()
+        motion = context.run(run_wave(dm, wave_generator(dm, amplitude, waves), frequency, seconds))
+        info = dm.info
+    asked = {"amplitude": amplitude, "frequency_hz": frequency, "waves": waves, "seconds": seconds}
+    context.show(
+        f"{info.model} {info.serial}: {motion.commands} commands, largest {motion.peak:.4g}, then flat"
+    )
+    context.report(simulated=info.simulated, changed=True, asked=asked, **asdict(motion))
 
 
 @app.command("status")
-def status(
-    system: options.System,
-    set: options.Set = None,
-    seed: options.Seed = None,
-    mode: options.Mode = None,
-    json: options.Json = False,
-) -> None:
+@command("dm status")
+def status(context: CommandContext, selection: options.Selection) -> None:
     """Show properties and limits of the mirror.
 
     An adaptive secondary is only observed. Any other mirror is opened, and flat when it is closed.
     """
-    with command_context("dm status", json=json) as context:
-        from escape_hw.api.adaptive_secondary import AdaptiveSecondary
+    from escape_hw.api.adaptive_secondary import AdaptiveSecondary
 
-        config, dm = _mirror(context, options.SystemSelection.of(system, set, seed, mode))
-        rest: dict[str, Any] = {"health": None}
-        if isinstance(dm, AdaptiveSecondary):
-            context.devices_opened = True
-            health = dm.observe_health()
-            rest["health"], changed = asdict(health), False
-            context.show(f"{health.state}, gap {health.gap_m * 1e6:.1f} um {health.fault}".rstrip())
-        else:
-            announce_change(context, config, "dm", "it is opened, and flattened when it is closed")
-            with open_device(context, dm):
-                changed = True
-        info, limits = dm.info, dm.limits
-        context.show(
-            f"{info.model} {info.serial}: {info.n_act} actuators, full stroke {info.stroke_m * 1e6:g} um"
-        )
-        context.show(f"limits: {', '.join(f'{key} {value}' for key, value in asdict(limits).items())}")
-        report_device_result(
-            context, "dm status", config, info.simulated, changed,
-            model=info.model, serial=info.serial, n_act=info.n_act, stroke_m=info.stroke_m,
-            limits=asdict(limits), **rest,
-        )  # fmt: skip
+    config, dm = _mirror(context, selection)
+    rest: dict[str, Any] = {"health": None}
+    if isinstance(dm, AdaptiveSecondary):
+        context.devices_opened = True
+        health = dm.observe_health()
+        rest["health"], changed = asdict(health), False
+        context.show(f"{health.state}, gap {health.gap_m * 1e6:.1f} um {health.fault}".rstrip())
+    else:
+        announce_change(context, config, "dm", "it is opened, and flattened when it is closed")
+        with context.opened(dm):
+            changed = True
+    info, limits = dm.info, dm.limits
+    context.show(
+        f"{info.model} {info.serial}: {info.n_act} actuators, full stroke {info.stroke_m * 1e6:g} um"
+    )
+    context.show(f"limits: {', '.join(f'{key} {value}' for key, value in asdict(limits).items())}")
+    context.report(
+        simulated=info.simulated, changed=changed, model=info.model, serial=info.serial, n_act=info.n_act,
+        stroke_m=info.stroke_m, limits=asdict(limits), **rest,
+    )  # fmt: skip
 
 
 def _mirror(
@@ -167,15 +140,7 @@ def _preserve_floating(dm: DeformableMirror) -> None:
 
 
 def _require_actuator(config: SystemConfig, actuator: int, amplitude: float) -> None:
-    """Check the poke before anything is opened.
-
-    Raises
-    ------
-    ConfigError
-        The actuator does not exist or is disabled, or the poke exceeds the stroke.
-    """
-    from escape_hw.errors import ConfigError
-
+    """Refuse a poke of a missing or disabled actuator, or beyond the stroke, before anything is opened."""
     section = config.devices.dm
     if actuator >= section.n_act:
         raise ConfigError(f"actuator {actuator}: does not exist; the mirror has 0 to {section.n_act - 1}")
@@ -185,14 +150,3 @@ def _require_actuator(config: SystemConfig, actuator: int, amplitude: float) -> 
         raise ConfigError(
             f"amplitude {amplitude:g}: exceeds devices.dm.limits.max_stroke, {section.limits.max_stroke}"
         )
-
-
-def _report_motion(
-    context: CommandContext,
-    command: str,
-    config: SystemConfig,
-    simulated: bool,
-    asked: dict[str, Any],
-    motion: DriveResult,
-) -> None:
-    report_device_result(context, command, config, simulated, True, asked=asked, **asdict(motion))

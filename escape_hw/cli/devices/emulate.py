@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from escape_hw.cli import options
-from escape_hw.cli.context import CommandContext, command_context
+from escape_hw.cli.command import command
+from escape_hw.cli.context import CommandContext
+from escape_hw.errors import ConfigError
 
 if TYPE_CHECKING:
     from escape_hw.api.emulator import Emulator
@@ -17,7 +18,9 @@ if TYPE_CHECKING:
 _POLL_S = 0.2
 
 
+@command("emulate")
 def emulate(
+    context: CommandContext,
     name: Annotated[str, typer.Argument(help="Device, such as e727; without one, lists them.")] = "",
     host: Annotated[str, typer.Option("--host", help="Network interface to listen on.")] = "127.0.0.1",
     port: Annotated[
@@ -32,29 +35,24 @@ def emulate(
     seconds: Annotated[
         float | None, typer.Option("--seconds", min=0, help="Stop after this time (default: at Ctrl-C).")
     ] = None,
-    json: options.Json = False,
 ) -> None:
     """Emulate a device on its own interface until Ctrl-C; reports errors of clients (exit code 1)."""
-    with command_context("emulate", json=json) as context:
-        from escape_hw.api.emulator import EmulatorRequest
-        from escape_hw.config.registry import EMULATORS, available, emulator_factory
-        from escape_hw.io.documents import header_fields
+    from escape_hw.api.emulator import EmulatorRequest
+    from escape_hw.config.registry import EMULATORS, available, emulator_factory
 
-        document = header_fields("emulate", None, True, None)
-        if not name:
-            context.show(*available(EMULATORS))
-            context.result({**document, "emulators": list(available(EMULATORS))})
-            return
-        request = EmulatorRequest(host, port, pty, dict(map(_parse_option, option or ())))
-        emulator = emulator_factory(name)(request)
-        context.result({**document, "emulator": name, **_serve(context, name, emulator, seconds)})
-        if emulator.violations:
-            context.code = context.code or 1
+    context.set_subject(None, True, None)
+    if not name:
+        context.show(*available(EMULATORS))
+        context.report(emulators=list(available(EMULATORS)))
+        return
+    request = EmulatorRequest(host, port, pty, dict(map(_parse_option, option or ())))
+    emulator = emulator_factory(name)(request)
+    context.report(emulator=name, **_serve(context, name, emulator, seconds))
+    if emulator.violations:
+        context.code = context.code or 1
 
 
 def _parse_option(text: str) -> tuple[str, str]:
-    from escape_hw.errors import ConfigError
-
     key, equals, value = text.partition("=")
     if not equals or not key:
         raise ConfigError(f"--option {text}: write KEY=VALUE")

@@ -9,8 +9,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from escape_hw.cli import options
-from escape_hw.cli.context import CommandContext, command_context
-from escape_hw.cli.devices.device_tools import announce_change, open_device
+from escape_hw.cli.command import command
+from escape_hw.cli.context import CommandContext
+from escape_hw.cli.devices.device_tools import announce_change
+from escape_hw.errors import ConfigError
 
 if TYPE_CHECKING:
     from escape_hw.api.modulator import Modulation, ModulatorStatus, TipTiltModulator
@@ -23,8 +25,10 @@ app = typer.Typer(
 
 
 @app.command("start")
+@command("modulator start")
 def start(
-    system: options.System,
+    context: CommandContext,
+    selection: options.Selection,
     radius: Annotated[
         float | None,
         typer.Option("--radius", min=0, help="lambda/D on the pyramid (default: as configured)."),
@@ -38,91 +42,69 @@ def start(
             "--seconds", min=0, help="Modulate for this time, then park (default: keep modulating)."
         ),
     ] = None,
-    set: options.Set = None,
-    seed: options.Seed = None,
-    mode: options.Mode = None,
-    json: options.Json = False,
 ) -> None:
     """Modulate on a circle: MOVES the stage (servos on, auto-zero where needed, centre, circle).
 
     The stage continues by its own clock after the command; 'escape modulator stop' stops it. A simulated
     one ends with the command.
     """
-    with command_context("modulator start", json=json) as context:
-        from escape_hw.api.modulator import Modulation
-        from escape_hw.config.sensor import PyramidSection
+    from escape_hw.api.modulator import Modulation
+    from escape_hw.config.sensor import PyramidSection
 
-        config, section, device = _device(context, options.SystemSelection.of(system, set, seed, mode))
-        radius_lambda_d = config.sensor_as(PyramidSection).modulation if radius is None else radius
-        requested = Modulation(radius_lambda_d * section.rad_per_lambda_d, frequency or section.frequency_hz)
-        announce_change(
-            context, config, "modulator", "servos on, auto-zero where needed, centre, then the circle"
-        )
-        with open_device(context, device):
-            achievable = device.check(requested)
-            context.notify(f"requested: {_format_modulation(requested, section)}")
-            context.notify(f"achievable: {_format_modulation(achievable, section)}")
-            device.modulate(requested)
-            if seconds is not None:
-                time.sleep(seconds)
-            status = device.status()
-            left = seconds is None and device.release()
-        final_state = "modulating; stop it with: escape modulator stop" if left else "parked"
-        context.show(*_format_status(status, section), f"left {final_state}")
-        asked = {"radius_lambda_d": radius_lambda_d, "frequency_hz": requested.frequency_hz}
-        outcome = {"asked": asked, "foreseen": asdict(achievable), "left": "turning" if left else "parked"}
-        context.result({**_document("start", config, status, section), **outcome, "changed": True})
+    config, section, device = _device(context, selection)
+    radius_lambda_d = config.sensor_as(PyramidSection).modulation if radius is None else radius
+    requested = Modulation(radius_lambda_d * section.rad_per_lambda_d, frequency or section.frequency_hz)
+    announce_change(
+        context, config, "modulator", "servos on, auto-zero where needed, centre, then the circle"
+    )
+    with context.opened(device):
+        achievable = device.check(requested)
+        context.notify(f"requested: {_format_modulation(requested, section)}")
+        context.notify(f"achievable: {_format_modulation(achievable, section)}")
+        device.modulate(requested)
+        if seconds is not None:
+            time.sleep(seconds)
+        status = device.status()
+        left = seconds is None and device.release()
+    final_state = "modulating; stop it with: escape modulator stop" if left else "parked"
+    context.show(*_format_status(status, section), f"left {final_state}")
+    asked = {"radius_lambda_d": radius_lambda_d, "frequency_hz": requested.frequency_hz}
+    context.report(
+        **_status_fields(status, section), asked=asked, foreseen=asdict(achievable),
+        left="turning" if left else "parked", changed=True,
+    )  # fmt: skip
 
 
 @app.command("stop")
-def stop(
-    system: options.System,
-    set: options.Set = None,
-    seed: options.Seed = None,
-    mode: options.Mode = None,
-    json: options.Json = False,
-) -> None:
+@command("modulator stop")
+def stop(context: CommandContext, selection: options.Selection) -> None:
     """Stop and park: MOVES the stage to its centre, then switches its servos off."""
-    with command_context("modulator stop", json=json) as context:
-        config, section, device = _device(context, options.SystemSelection.of(system, set, seed, mode))
-        announce_change(context, config, "modulator", "centre, servos off")
-        with open_device(context, device):
-            device.park()
-            status = device.status()
-        context.show(*_format_status(status, section), "left parked")
-        context.result({**_document("stop", config, status, section), "left": "parked", "changed": True})
+    config, section, device = _device(context, selection)
+    announce_change(context, config, "modulator", "centre, servos off")
+    with context.opened(device):
+        device.park()
+        status = device.status()
+    context.show(*_format_status(status, section), "left parked")
+    context.report(**_status_fields(status, section), left="parked", changed=True)
 
 
 @app.command("status")
-def status(
-    system: options.System,
-    set: options.Set = None,
-    seed: options.Seed = None,
-    mode: options.Mode = None,
-    json: options.Json = False,
-) -> None:
+@command("modulator status")
+def status(context: CommandContext, selection: options.Selection) -> None:
     """Show the state of the modulator; moves and changes nothing."""
-    with command_context("modulator status", json=json) as context:
-        config, section, device = _device(context, options.SystemSelection.of(system, set, seed, mode))
-        context.devices_opened = True
-        now = device.status()
-        context.show(*_format_status(now, section))
-        context.result({**_document("status", config, now, section), "changed": False})
+    _, section, device = _device(context, selection)
+    context.devices_opened = True
+    now = device.status()
+    context.show(*_format_status(now, section))
+    context.report(**_status_fields(now, section), changed=False)
 
 
 def _device(
     context: CommandContext, selection: options.SystemSelection
 ) -> tuple[SystemConfig, ModulatorConfig, TipTiltModulator]:
-    """The system's modulator, not open.
-
-    Raises
-    ------
-    ConfigError
-        The system has none, or its driver is not installed.
-    """
+    """The system's modulator, not open."""
     from escape_hw.api.modulator import TipTiltModulator
     from escape_hw.bench import build_device
-    from escape_hw.errors import ConfigError
 
     config = context.load_config(selection)
     section = config.devices.modulator
@@ -146,16 +128,9 @@ def _format_status(status: ModulatorStatus, section: ModulatorConfig) -> list[st
     return [*rows, *(f"{key}: {value}" for key, value in status.details.items())]
 
 
-def _document(
-    command: str, config: SystemConfig, status: ModulatorStatus, section: ModulatorConfig
-) -> dict[str, Any]:
-    """The part of the document that describes the status."""
-    from escape_hw.io.documents import header_fields
-
-    document: dict[str, Any] = header_fields(
-        f"modulator {command}", config.system.name, status.info.simulated, config.system.seed
-    )
-    found = asdict(status)
+def _status_fields(status: ModulatorStatus, section: ModulatorConfig) -> dict[str, Any]:
+    """The status in the command's document."""
+    found = {"simulated": status.info.simulated, **asdict(status)}
     if status.modulation is not None:
         found["modulation"]["radius_lambda_d"] = status.modulation.radius_rad / section.rad_per_lambda_d
-    return {**document, **found}
+    return found

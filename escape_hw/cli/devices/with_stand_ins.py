@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from escape_hw.cli import options
-from escape_hw.cli.context import CommandContext, command_context
+from escape_hw.cli.command import command
+from escape_hw.cli.context import CommandContext
 
 if TYPE_CHECKING:
     from escape_hw.api.emulator import StandInBench
@@ -24,41 +25,36 @@ _ESCAPE = (sys.executable, "-c", "from escape_hw.cli import main; main()")
 _NOT_FOUND = 127
 
 
+@command("with-stand-ins", without=("mode",))
 def with_stand_ins(
-    system: options.System,
+    context: CommandContext,
+    selection: options.Selection,
     command: Annotated[
         list[str] | None,
         typer.Argument(help="Command to run, after '--'; without one, runs until Ctrl-C."),
     ] = None,
-    set: options.Set = None,
-    seed: options.Seed = None,
-    json: options.Json = False,
 ) -> None:
     """Run the real drivers on a simulated bench, with stand-ins for the vendor libraries.
 
     escape with-stand-ins razor-shwfs -- escape calibrate razor-shwfs --mode hardware
     """
-    with command_context("with-stand-ins", json=json) as context:
-        from escape_hw.config.registry import stand_in_bench_factory
-        from escape_hw.io.documents import header_fields
+    from escape_hw.config.registry import stand_in_bench_factory
 
-        selection = options.SystemSelection.of(system, set, seed, None)
-        config = context.load_config(selection)
-        stand_ins = stand_in_bench_factory()(config)
-        stand_ins.start()
-        try:
-            if command:
-                context.code = _run(context, command, stand_ins.environment)
-                return
-            environment = dict(stand_ins.environment)
-            context.show(*(f"export {key}={shlex.quote(value)}" for key, value in environment.items()))
-            document = header_fields("with-stand-ins", config.system.name, True, config.system.seed)
-            context.result({**document, "environment": environment})
-            # A reader of the document must not wait for the end.
-            context.print_document()
-            _until_stopped(context, stand_ins)
-        finally:
-            stand_ins.stop()
+    config = context.load_config(selection)
+    stand_ins = stand_in_bench_factory()(config)
+    stand_ins.start()
+    try:
+        if command:
+            context.code = _run(context, command, stand_ins.environment)
+            return
+        environment = dict(stand_ins.environment)
+        context.show(*(f"export {key}={shlex.quote(value)}" for key, value in environment.items()))
+        context.report(simulated=True, environment=environment)
+        # A reader of the document must not wait for the end.
+        context.print_document()
+        _until_stopped(context, stand_ins)
+    finally:
+        stand_ins.stop()
 
 
 def _run(context: CommandContext, command: Sequence[str], environment: Mapping[str, str]) -> int:

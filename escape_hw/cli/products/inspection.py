@@ -7,29 +7,29 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from escape_hw.cli import options
-from escape_hw.cli.context import CommandContext, command_context
+from escape_hw.cli.command import command
+from escape_hw.cli.context import CommandContext
+from escape_hw.errors import CalibrationError
 
 if TYPE_CHECKING:
     from escape_hw.api.interaction_matrix import InteractionMatrix
 
 
+@command("show")
 def show(
+    context: CommandContext,
     file: Annotated[Path, typer.Argument(help="A product (FITS) or the folder of a run.")],
-    json: options.Json = False,
 ) -> None:
     """Summarise a product or a run."""
-    with command_context("show", json=json) as context:
-        if file.is_dir():
-            _show_run(context, file)
-        else:
-            _show_product(context, file)
+    if file.is_dir():
+        _show_run(context, file)
+    else:
+        _show_product(context, file)
 
 
 def _show_product(context: CommandContext, file: Path) -> None:
     from escape_hw.cli.formatting import rich_table, status_line
     from escape_hw.cli.products.summaries import summarise_product
-    from escape_hw.io import documents
     from escape_hw.io.fits import file as fits_file
     from escape_hw.report.tables import Table
 
@@ -40,8 +40,8 @@ def _show_product(context: CommandContext, file: Path) -> None:
     cards = tuple((key, str(value)) for key, value in header.items())
     context.show(f"{file}: kind {header['KIND']}", status_line(simulated, partial), *lines)
     context.show(rich_table(Table(("Card", "value"), cards, numeric=False)), f"SHA-256: {sha256}")
-    header_fields = documents.header_fields("show", header["SYSTEM"], simulated, header.get("SEED"))
-    context.result({**header_fields, **document, "file": file.absolute(), "header": header, "sha256": sha256})
+    context.set_subject(header["SYSTEM"], simulated, header.get("SEED"))
+    context.report(**document, file=file.absolute(), header=header, sha256=sha256)
 
 
 def _show_run(context: CommandContext, folder: Path) -> None:
@@ -62,30 +62,28 @@ def _show_run(context: CommandContext, folder: Path) -> None:
     context.result({**document, "folder": run.folder})
 
 
+@command("compare")
 def compare(
+    context: CommandContext,
     first: Annotated[Path, typer.Argument(metavar="A", help="Interaction matrix (FITS).")],
     second: Annotated[Path, typer.Argument(metavar="B", help="Interaction matrix (FITS).")],
-    json: options.Json = False,
 ) -> None:
     """Compare two interaction matrices mode by mode, and their registrations."""
-    with command_context("compare", json=json) as context:
-        from escape_hw.cli.formatting import rich_table
-        from escape_hw.io.documents import header_fields
-        from escape_hw.io.fits.matrix import load_matrix
-        from escape_hw.report import comparison
+    from escape_hw.cli.formatting import rich_table
+    from escape_hw.io.fits.matrix import load_matrix
+    from escape_hw.report import comparison
 
-        a, b = load_matrix(first), load_matrix(second)
-        result = comparison.compare(a.result, b.result)
-        context.show(f"A: {first} ({a.matrix.method})", f"B: {second} ({b.matrix.method})")
-        context.show(*comparison.summary_lines(result))
-        gains = _optical_gains(context, a.matrix, b.matrix)
-        context.show(rich_table(comparison.mode_table(result)))
-        if result.registration:
-            context.show(rich_table(comparison.registration_table(result)))
-        simulated = a.matrix.simulated or b.matrix.simulated
-        document: dict[str, Any] = header_fields("compare", a.matrix.system, simulated, None)
-        document |= {"a": first.absolute(), "b": second.absolute(), "optical_gain": gains}
-        context.result({**document, **result.to_dict()})
+    a, b = load_matrix(first), load_matrix(second)
+    result = comparison.compare(a.result, b.result)
+    context.show(f"A: {first} ({a.matrix.method})", f"B: {second} ({b.matrix.method})")
+    context.show(*comparison.summary_lines(result))
+    gains = _optical_gains(context, a.matrix, b.matrix)
+    context.show(rich_table(comparison.mode_table(result)))
+    if result.registration:
+        context.show(rich_table(comparison.registration_table(result)))
+    simulated = a.matrix.simulated or b.matrix.simulated
+    context.set_subject(a.matrix.system, simulated, None)
+    context.report(a=first.absolute(), b=second.absolute(), optical_gain=gains, **result.to_dict())
 
 
 def _optical_gains(
@@ -93,7 +91,6 @@ def _optical_gains(
 ) -> dict[str, Any] | None:
     """Gains of B relative to A, by the paper's ratio of deviations and by an unbiased projection."""
     from escape_hw.calibration.optical_gain.matrix_comparison import deviation_ratio, projection
-    from escape_hw.errors import CalibrationError
 
     try:
         found = {"deviation_ratio": deviation_ratio(b, a), "projection": projection(b, a)}
@@ -108,27 +105,24 @@ def _optical_gains(
     return {name: {"value": value, "sigma": sigma} for name, (value, sigma) in found.items()}
 
 
+@command("report")
 def report(
+    context: CommandContext,
     run: Annotated[Path, typer.Argument(help="Folder of a run.")],
     picture: Annotated[
         Path | None, typer.Option("--picture", metavar="FILE", help="Also draw matrices and images as PNG.")
     ] = None,
-    json: options.Json = False,
 ) -> None:
     """Build the report of a run again from its products."""
-    with command_context("report", json=json) as context:
-        from escape_hw.io.documents import header_fields
-        from escape_hw.io.run_folder import read_result
-        from escape_hw.report.run_report import write_report
+    from escape_hw.io.run_folder import read_result
+    from escape_hw.report.run_report import write_picture, write_report
 
-        path = write_report(run)
-        old = read_result(run)
-        context.show(f"report: {path}")
-        document = header_fields("report", old["system"], old["simulated"], old["seed"])
-        document["report"] = path
-        if picture is not None:
-            from escape_hw.report.run_report import write_picture
-
-            document["picture"] = write_picture(run, picture).absolute()
-            context.show(f"picture: {picture}")
-        context.result(document)
+    path = write_report(run)
+    old = read_result(run)
+    context.show(f"report: {path}")
+    context.set_subject(old["system"], old["simulated"], old["seed"])
+    files: dict[str, Any] = {"report": path}
+    if picture is not None:
+        files["picture"] = write_picture(run, picture).absolute()
+        context.show(f"picture: {picture}")
+    context.report(**files)

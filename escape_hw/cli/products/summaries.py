@@ -27,13 +27,7 @@ ProductSummary = tuple[dict[str, Any], list[RenderableType]]
 
 
 def summarise_product(kind: str, file: Path) -> ProductSummary:
-    """Document and lines of a product.
-
-    Raises
-    ------
-    ProductError
-        The file is damaged, or of an unknown kind.
-    """
+    """Document and lines of a product."""
     summarise = _SUMMARIES.get(kind)
     if summarise is None:
         raise ProductError(f"{file}: unknown kind {kind!r}; known are {', '.join(sorted(_SUMMARIES))}")

@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from escape_hw.cli import options
-from escape_hw.cli.context import command_context
+from escape_hw.cli.command import command
+from escape_hw.cli.context import CommandContext
+from escape_hw.errors import ConfigError
 
 if TYPE_CHECKING:
     from escape_hw.config.system import SystemConfig
@@ -16,21 +18,20 @@ if TYPE_CHECKING:
 config_app = typer.Typer(help="Check, create and describe configurations.", no_args_is_help=True)
 
 
-def systems(json: options.Json = False) -> None:
+@command("systems")
+def systems(context: CommandContext) -> None:
     """List the systems that come with the package."""
-    with command_context("systems", json=json) as context:
-        from escape_hw.cli.formatting import rich_table
-        from escape_hw.config.bundled import bundled_systems
-        from escape_hw.config.loader import load_system
-        from escape_hw.io.documents import header_fields
-        from escape_hw.report.tables import Table
+    from escape_hw.cli.formatting import rich_table
+    from escape_hw.config.bundled import bundled_systems
+    from escape_hw.config.loader import load_system
+    from escape_hw.report.tables import Table
 
-        rows = [_describe(load_system(name)) for name in bundled_systems()]
-        headings = ("system", "mode", "actuators", "modes", "description")
-        keys = ("name", "mode", "n_act", "n_modes", "description")
-        cells = tuple(tuple(str(row[key]) for key in keys) for row in rows)
-        context.show(rich_table(Table(headings, cells, numeric=False)))
-        context.result({**header_fields("systems", None, None, None), "systems": rows})
+    rows = [_describe(load_system(name)) for name in bundled_systems()]
+    headings = ("system", "mode", "actuators", "modes", "description")
+    keys = ("name", "mode", "n_act", "n_modes", "description")
+    cells = tuple(tuple(str(row[key]) for key in keys) for row in rows)
+    context.show(rich_table(Table(headings, cells, numeric=False)))
+    context.report(systems=rows)
 
 
 def _describe(config: SystemConfig) -> dict[str, Any]:
@@ -41,56 +42,51 @@ def _describe(config: SystemConfig) -> dict[str, Any]:
 
 
 @config_app.command("check")
+@command("config check")
 def check(
-    file: Annotated[str, typer.Argument(help="TOML file, or the name of a system.")],
-    set: options.Set = None,
-    seed: options.Seed = None,
-    mode: options.Mode = None,
-    json: options.Json = False,
+    context: CommandContext,
+    selection: Annotated[
+        options.SystemSelection, typer.Argument(metavar="FILE", help="TOML file, or the name of a system.")
+    ],
 ) -> None:
     """Check a configuration; reports all errors with file, line, key and allowed range."""
-    with command_context("config check", json=json) as context:
-        from escape_hw.io.documents import header_fields
-
-        config = context.load_config(options.SystemSelection.of(file, set, seed, mode))
-        context.show(f"{file}: valid ({config.system.name}, mode {config.system.mode})")
-        document = header_fields("config check", config.system.name, config.simulated, config.system.seed)
-        context.result({**document, "file": file, "valid": True})
+    config = context.load_config(selection)
+    context.show(f"{selection.system}: valid ({config.system.name}, mode {config.system.mode})")
+    context.report(file=selection.system, valid=True)
 
 
 @config_app.command("init")
+@command("config init")
 def init(
+    context: CommandContext,
     name: Annotated[str, typer.Argument(help="Name of the new system.")] = "my-system",
     base: Annotated[str, typer.Option("--base", help="System whose values are used.")] = "razor-shwfs",
     out: Annotated[
         Path | None, typer.Option("--out", metavar="FILE", help="File to write (default: standard output).")
     ] = None,
-    json: options.Json = False,
 ) -> None:
     """Write a new configuration: every key with its meaning, unit and range."""
-    with command_context("config init", json=json) as context:
-        from escape_hw.config.templates import starter_text
-        from escape_hw.errors import ConfigError
-        from escape_hw.io.documents import header_fields
-        from escape_hw.io.storage import write_atomic
+    from escape_hw.config.templates import starter_text
+    from escape_hw.io.storage import write_atomic
 
-        text = starter_text(name, base)
-        document = header_fields("config init", name, None, None)
-        if out is None:
-            context.show(text.rstrip("\n"))
-            context.result({**document, "toml": text})
-            return
-        if out.exists():
-            raise ConfigError(f"{out}: exists already; choose another name or remove it first")
-        write_atomic(out, text.encode())
-        context.show(f"{out}: written; edit it, then: escape config check {out}")
-        context.result({**document, "file": out})
+    text = starter_text(name, base)
+    context.set_subject(name, None, None)
+    if out is None:
+        context.show(text.rstrip("\n"))
+        context.report(toml=text)
+        return
+    if out.exists():
+        raise ConfigError(f"{out}: exists already; choose another name or remove it first")
+    write_atomic(out, text.encode())
+    context.show(f"{out}: written; edit it, then: escape config check {out}")
+    context.report(file=out)
 
 
 @config_app.command("schema")
-def schema(json: options.Json = False) -> None:
+@command("config schema")
+def schema(context: CommandContext) -> None:
     """Print the JSON schema of the system files, for editors."""
-    with command_context("config schema", json=True) as context:
-        from escape_hw.config.templates import json_schema
+    from escape_hw.config.templates import json_schema
 
-        context.result(json_schema())
+    context.json = True
+    context.result(json_schema())

@@ -3,47 +3,38 @@
 from __future__ import annotations
 
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated
 
 import typer
 
-from escape_hw.cli import options
-from escape_hw.cli.context import command_context
-
-if TYPE_CHECKING:
-    from escape_hw.runtime.host.doctor import Finding
+from escape_hw.cli.command import command
+from escape_hw.cli.context import CommandContext
+from escape_hw.cli.options import NO_SYSTEM, SystemSelection
 
 _SYMBOLS = {"ok": "✓", "info": "·", "warning": "!", "error": "✗"}
 
 
+@command("doctor", without=("seed",))
 def doctor(
-    system: Annotated[
-        str, typer.Argument(metavar="[SYSTEM]", help="System whose real devices must work (default: none).")
-    ] = "",
-    set: options.Set = None,
-    mode: options.Mode = None,
-    json: options.Json = False,
+    context: CommandContext,
+    selection: Annotated[
+        SystemSelection, typer.Argument(help="System whose real devices must work (default: none).")
+    ] = NO_SYSTEM,
 ) -> None:
     """Check that this computer is set up for real devices. Opens none.
 
     Exit codes: 0 no finding, 1 warnings, 2 errors.
     """
-    with command_context("doctor", json=json) as context:
-        from escape_hw.io.documents import header_fields
-        from escape_hw.runtime.host.doctor import check_computer, exit_code
+    from escape_hw.runtime.host.doctor import check_computer, exit_code
 
-        config = context.load_config(options.SystemSelection.of(system, set, None, mode)) if system else None
-        findings = check_computer(config)
-        for finding in findings:
-            context.show(f"{_SYMBOLS[finding.level]} {finding.item}: {finding.text}")
-            if finding.remedy:
-                context.show(f"    → {finding.remedy}")
-        code = exit_code(findings)
-        start = header_fields("doctor", system or None, None if config is None else config.simulated, None)
-        context.result({**start, "verdict": code, "findings": [_to_dict(one) for one in findings]})
-        context.code = code
-
-
-def _to_dict(finding: Finding) -> dict[str, Any]:
-    """A finding for ``--json``; version 0.1.0 called the remedy ``way_out``."""
-    return {**asdict(finding), "way_out": finding.remedy}
+    config = context.load_config(selection) if selection.system else None
+    findings = check_computer(config)
+    for finding in findings:
+        context.show(f"{_SYMBOLS[finding.level]} {finding.item}: {finding.text}")
+        if finding.remedy:
+            context.show(f"    → {finding.remedy}")
+    code = exit_code(findings)
+    context.set_subject(selection.system or None, None if config is None else config.simulated, None)
+    # "way_out" is the name of version 0.1.0.
+    context.report(verdict=code, findings=[{**asdict(one), "way_out": one.remedy} for one in findings])
+    context.code = code

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from escape_hw.cli.context import command_context
+from escape_hw.errors import ConfigError, ProductError
 
 
 def gui(
@@ -33,7 +34,6 @@ def gui(
     """Open the window: live views, calibrations, the loop."""
     with command_context("gui") as context:
         from escape_hw.config.registry import window_runner
-        from escape_hw.errors import ConfigError
 
         if system and connect:
             raise ConfigError("give a system or --connect, not both")
@@ -50,7 +50,6 @@ def replay(
     """Replay a finished run in the window."""
     with command_context("replay") as context:
         from escape_hw.config.registry import window_runner
-        from escape_hw.errors import ProductError
 
         if not recording.is_dir() and not (recording.suffix == ".fits" and recording.is_file()):
             raise ProductError(f"{recording}: neither a product (.fits) nor the folder of a run")

@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
 
-from escape_hw.cli.context import command_context
+from escape_hw.cli.command import command
+from escape_hw.cli.context import CommandContext
 from escape_hw.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -59,13 +60,7 @@ def _processor() -> str:
 
 
 def require_page(page: Path) -> None:
-    """Check that the table can be written into a page.
-
-    Raises
-    ------
-    ConfigError
-        The page exists without the two marks, or its folder does not exist.
-    """
+    """Check that the table can be written into a page."""
     if page.exists():
         text = page.read_text(encoding="utf-8")
         if text.count(BEGIN) != 1 or text.count(END) != 1 or text.index(BEGIN) > text.index(END):
@@ -121,18 +116,7 @@ def find_benchmarks() -> dict[str, EntryPoint]:
 
 
 def run_benchmarks(stages: Sequence[str] = ()) -> list[BenchmarkRow]:
-    """Run benchmark stages.
-
-    Parameters
-    ----------
-    stages
-        Names; all of them by default.
-
-    Raises
-    ------
-    ConfigError
-        A stage does not exist.
-    """
+    """Run the named benchmark stages, all of them by default."""
     from escape_hw.api.concurrency import limit_to_one_thread
 
     known = find_benchmarks()
@@ -159,11 +143,12 @@ def document(rows: Sequence[BenchmarkRow]) -> dict[str, Any]:
     }
 
 
+@command("perf")
 def perf(
+    context: CommandContext,
     stages: Annotated[
         list[str] | None, typer.Argument(metavar="[STAGE]...", help="Stages to measure; all by default.")
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document.")] = False,
     page: Annotated[
         Path | None,
         typer.Option(
@@ -172,14 +157,13 @@ def perf(
     ] = None,
 ) -> None:
     """Benchmark speed and accuracy beside OOPAO and pyRTC, on one thread each."""
-    with command_context("perf", json=as_json) as context:
-        if page is not None:
-            require_page(page)
-        rows = run_benchmarks(stages or ())
-        if page is not None:
-            write_page(page, rows, measurement_conditions())
-        context.show(_table(rows))
-        context.result(document(rows))
+    if page is not None:
+        require_page(page)
+    rows = run_benchmarks(stages or ())
+    if page is not None:
+        write_page(page, rows, measurement_conditions())
+    context.show(_table(rows))
+    context.result(document(rows))
 
 
 def _table(rows: Sequence[BenchmarkRow]) -> Table:

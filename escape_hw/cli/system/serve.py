@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from escape_hw.cli import options
-from escape_hw.cli.context import CommandContext, command_context
+from escape_hw.cli.command import command
+from escape_hw.cli.context import CommandContext
+from escape_hw.errors import ConfigError
 
 if TYPE_CHECKING:
     from escape_hw.config.system import SystemConfig
@@ -17,8 +19,10 @@ if TYPE_CHECKING:
 _LOOPBACK = "127.0.0.1"
 
 
+@command("serve", quiet=True)
 def serve(
-    system: options.System,
+    context: CommandContext,
+    selection: options.Selection,
     port: Annotated[
         int | None,
         typer.Option("--port", min=1, max=65534, help="Listen on TCP as well; events use the next port."),
@@ -33,39 +37,28 @@ def serve(
     out: Annotated[
         Path | None, typer.Option("--out", metavar="DIR", help="Parent of run folders (default: user data).")
     ] = None,
-    set: options.Set = None,
-    seed: options.Seed = None,
-    mode: options.Mode = None,
-    json: options.Json = False,
-    quiet: options.Quiet = False,
 ) -> None:
     """Open the devices of a system, and serve windows, scripts and notebooks until stopped."""
-    with command_context("serve", json=json, quiet=quiet) as context:
-        from escape_hw.errors import ConfigError
-        from escape_hw.io.run_folder import default_runs_folder
-        from escape_hw.server.frontend.front_end import Server
+    from escape_hw.io.run_folder import default_runs_folder
+    from escape_hw.server.frontend.front_end import Server
 
-        if port is None and bind != _LOOPBACK:
-            raise ConfigError(f"--bind {bind} needs --port; without it the server has local sockets only")
-        config = context.load_config(options.SystemSelection.of(system, set, seed, mode))
-        runs = default_runs_folder() if out is None else out.expanduser().absolute()
-        with Server(config, bind, port) as server:
-            _print_listing(context, config, server.listing)
-            with context.interrupts.procedure() as stop:
-                context.devices_opened = True
-                server.run(stop, runs, tuple(read or ()))
-            context.interrupts.begin_closing()
-        context.notify("serve: stopped, mirror flat")
+    if port is None and bind != _LOOPBACK:
+        raise ConfigError(f"--bind {bind} needs --port; without it the server has local sockets only")
+    config = context.load_config(selection)
+    runs = default_runs_folder() if out is None else out.expanduser().absolute()
+    with context.interrupts.protect_closing(Server(config, bind, port)) as server:
+        _print_listing(context, config, server.listing)
+        with context.interrupts.procedure() as stop:
+            context.devices_opened = True
+            server.run(stop, runs, tuple(read or ()))
+    context.notify("serve: stopped, mirror flat")
 
 
 def _print_listing(context: CommandContext, config: SystemConfig, listing: ServerListing) -> None:
     from dataclasses import asdict
 
-    from escape_hw.io.documents import header_fields
-
     name = config.system.name
-    document = header_fields("serve", name, config.simulated, config.system.seed)
-    context.result({**document, **asdict(listing)})
+    context.report(**asdict(listing))
     # Printed now: programs that start a server read its addresses while it runs.
     context.print_document()
     kind = "simulated" if config.simulated else "HARDWARE"

@@ -6,12 +6,12 @@ import math
 import time
 from collections.abc import Iterable
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from escape_hw.cli import options
-from escape_hw.cli.context import CommandContext, command_context
+from escape_hw.cli.command import command
+from escape_hw.cli.context import CommandContext
 
 if TYPE_CHECKING:
     from rich.table import Table as RichTable
@@ -22,33 +22,33 @@ if TYPE_CHECKING:
 _PERIOD_S = 1.0
 
 
+@command("streams")
 def streams(
+    context: CommandContext,
     remove_orphaned: Annotated[
         bool, typer.Option("--reap", help="Remove shared memory of dead servers.")
     ] = False,
     seconds: Annotated[
         float | None, typer.Option("--seconds", min=0, help="How long to watch (default: until Ctrl-C).")
     ] = None,
-    json: options.Json = False,
 ) -> None:
     """Show the streams of this computer's servers: rate, size, writer, readers, intervals.
 
     With --json, or without a terminal, it measures for a second and ends.
     """
-    with command_context("streams", json=json) as context:
-        from escape_hw.io.documents import header_fields
-        from escape_hw.streams.segments import remove_orphaned as clear
+    from escape_hw.streams.segments import remove_orphaned as clear
 
-        removed = clear() if remove_orphaned else ()
-        for segment in removed:
-            context.notify(f"removed {segment.name}: its process {segment.pid} has ended")
-        if remove_orphaned and not removed:
-            context.notify("nothing to remove: the process of every stream is alive")
-        rows = () if remove_orphaned else _watch_streams(context, seconds)
-        document = header_fields("streams", None, None, None)
-        context.result(
-            {**document, "streams": [_to_document(row) for row in rows], "removed": [s.name for s in removed]}
-        )
+    removed = clear() if remove_orphaned else ()
+    for segment in removed:
+        context.notify(f"removed {segment.name}: its process {segment.pid} has ended")
+    if remove_orphaned and not removed:
+        context.notify("nothing to remove: the process of every stream is alive")
+    rows = () if remove_orphaned else _watch_streams(context, seconds)
+    documents = [
+        {**asdict(row), "interval_us": dict(zip(("p50", "p99", "max"), row.interval_us, strict=True))}
+        for row in rows
+    ]
+    context.report(streams=documents, removed=[segment.name for segment in removed])
 
 
 def _watch_streams(context: CommandContext, seconds: float | None) -> tuple[StreamStatus, ...]:
@@ -100,8 +100,3 @@ def _cells(row: StreamStatus) -> tuple[str, ...]:
 
 def _number(value: float, form: str) -> str:
     return format(value, form) if math.isfinite(value) else "–"
-
-
-def _to_document(row: StreamStatus) -> dict[str, Any]:
-    p50, p99, largest = row.interval_us
-    return {**asdict(row), "interval_us": {"p50": p50, "p99": p99, "max": largest}}

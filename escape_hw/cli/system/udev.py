@@ -5,12 +5,12 @@ from __future__ import annotations
 import getpass
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from escape_hw.cli import options
-from escape_hw.cli.context import CommandContext, command_context
+from escape_hw.cli.command import command
+from escape_hw.cli.context import CommandContext
 
 if TYPE_CHECKING:
     from escape_hw.runtime.host.udev import Change
@@ -22,40 +22,41 @@ Root = Annotated[
 
 
 @app.command("show")
-def show(root: Root = Path("/"), json: options.Json = False) -> None:
+@command("udev show")
+def show(context: CommandContext, root: Root = Path("/")) -> None:
     """Show what is installed and what 'install' would change."""
-    with command_context("udev show", json=json) as context:
-        from escape_hw.runtime.host.udev import plan_changes
+    from escape_hw.runtime.host.udev import plan_changes
 
-        changes = plan_changes(root)
-        context.show(*_format_changes(changes))
-        _result(context, "udev show", changes, [])
+    changes = plan_changes(root)
+    context.show(*_format_changes(changes))
+    context.report(changed=False, files=[_to_dict(one) for one in changes], written=[])
 
 
 @app.command("install")
+@command("udev install")
 def install(
+    context: CommandContext,
     root: Root = Path("/"),
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask for confirmation.")] = False,
-    json: options.Json = False,
 ) -> None:
     """Show the changes, ask, and apply them. Exit code 1: changes are needed but were not applied."""
-    with command_context("udev install", json=json) as context:
-        from escape_hw.runtime.host import udev
+    from escape_hw.runtime.host import udev
 
-        changes = udev.plan_changes(root)
-        due = [change for change in changes if change.condition != "installed"]
-        context.show(*_format_changes(changes))
-        written: list[Path] = []
-        if due and not udev.is_writable(due):
-            context.notify(f"not permitted; run: sudo {Path(sys.argv[0]).absolute()} udev install")
-        elif due and (yes or _confirm(context)):
-            written = udev.apply_changes(due)
-            context.show(*(f"written: {path}" for path in written))
-            for failure in udev.reload_rules() if root == Path("/") else ():
-                context.notify(failure)
-        steps = udev.remaining_commands(getpass.getuser())
-        context.show("remaining manual steps, once:", *(f"  {step}" for step in steps))
-        _result(context, "udev install", changes, written, met=len(written) == len(due))
+    changes = udev.plan_changes(root)
+    due = [change for change in changes if change.condition != "installed"]
+    context.show(*_format_changes(changes))
+    written: list[Path] = []
+    if due and not udev.is_writable(due):
+        context.notify(f"not permitted; run: sudo {Path(sys.argv[0]).absolute()} udev install")
+    elif due and (yes or _confirm(context)):
+        written = udev.apply_changes(due)
+        context.show(*(f"written: {path}" for path in written))
+        for failure in udev.reload_rules() if root == Path("/") else ():
+            context.notify(failure)
+    steps = udev.remaining_commands(getpass.getuser())
+    context.show("remaining manual steps, once:", *(f"  {step}" for step in steps))
+    files = [_to_dict(one) for one in changes]
+    context.report(met=len(written) == len(due), changed=bool(written), files=files, written=written)
 
 
 def _confirm(context: CommandContext) -> bool:
@@ -74,12 +75,5 @@ def _format_changes(changes: list[Change]) -> list[str]:
     return lines
 
 
-def _result(
-    context: CommandContext, command: str, changes: list[Change], written: list[Path], met: bool = True
-) -> None:
-    from escape_hw.io.documents import header_fields
-
-    keys = ("source", "target", "condition", "difference")
-    files = [{key: getattr(change, key) for key in keys} for change in changes]
-    document = {**header_fields(command, None, None, None), "changed": bool(written)}
-    context.result({**document, "files": files, "written": written}, met=met)
+def _to_dict(change: Change) -> dict[str, Any]:
+    return {key: getattr(change, key) for key in ("source", "target", "condition", "difference")}

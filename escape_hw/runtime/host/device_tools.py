@@ -32,20 +32,10 @@ class DriveResult:
 
 @dataclass(frozen=True, slots=True)
 class CameraStatistics:
-    """Statistics of a camera's frames.
+    """Statistics of a camera's frames: number, the camera's own counters, rate by the times of exposure.
 
-    Parameters
-    ----------
-    frames
-        Frames delivered.
-    status
-        The camera's own counters.
-    rate_hz
-        From the frames' times of exposure.
-    mean, lowest, highest
-        Counts over all pixels and frames.
-    saturated
-        Saturated pixels of the worst frame.
+    ``mean``, ``lowest`` and ``highest`` are counts over all pixels and frames; ``saturated`` is the number of
+    saturated pixels in the worst frame.
     """
 
     frames: int
@@ -79,17 +69,7 @@ def poke_shape(dm: DeformableMirror, actuator: int, amplitude: float) -> NDArray
 
 
 def hold_shape(dm: DeformableMirror, shape: NDArray[np.float64], seconds: float) -> Procedure[DriveResult]:
-    """Hold a shape for a while, then flatten.
-
-    Parameters
-    ----------
-    dm
-        An open mirror.
-    shape
-        ``(n_act,)``, fractions of full stroke.
-    seconds
-        Duration by the wall clock.
-    """
+    """Hold a shape ``(n_act,)``, fractions of full stroke, for a while by the wall clock, then flatten."""
     report = Reporter("holding the shape", max(1, math.ceil(seconds)), "second")
     try:
         sent = dm.send(shape)
@@ -134,19 +114,7 @@ def wave_generator(
 def run_wave(
     dm: DeformableMirror, shape: Callable[[float], NDArray[np.float64]], frequency_hz: float, seconds: float
 ) -> Procedure[DriveResult]:
-    """Run a wave over the mirror, with a slow rise, then flatten.
-
-    Parameters
-    ----------
-    dm
-        An open mirror.
-    shape
-        From :func:`wave_generator`.
-    frequency_hz
-        Periods per second.
-    seconds
-        Duration by the wall clock.
-    """
+    """Run a wave from :func:`wave_generator` over an open mirror, with a slow rise, then flatten."""
     report = Reporter("wave", max(1, math.ceil(seconds)), "second")
     commands = skipped = 0
     peak = 0.0
@@ -157,7 +125,7 @@ def run_wave(
             sent = dm.send(flat + (shape(frequency_hz * at) - flat) * min(1.0, at / RISE_S))
             commands, skipped = commands + 1, skipped + sent.skipped
             peak = max(peak, float(np.abs(sent.sent).max()))
-            if report.due():
+            if report.is_due():
                 yield report(int(at), commands=commands)
             time.sleep(max(0.0, started + commands / WAVE_HZ - time.monotonic()))
         return DriveResult(commands, skipped, peak)
@@ -171,7 +139,7 @@ def grab_frames(camera: Camera, frames: int, timeout_s: float) -> Procedure[list
     found: list[Frame] = []
     for number in range(1, frames + 1):
         found.append(camera.next_frame(timeout_s))
-        if report.due():
+        if report.is_due():
             yield report(number)
     camera.stop()
     return found
@@ -188,7 +156,7 @@ def monitor_camera(camera: Camera, seconds: float, timeout_s: float) -> Procedur
         total += float(frame.data.mean())
         lowest, highest = min(lowest, int(frame.data.min())), max(highest, int(frame.data.max()))
         saturated = max(saturated, frame.n_saturated)
-        if report.due():
+        if report.is_due():
             yield report(int((last_ns - first_ns) * 1e-9), frames=frames, highest=highest)
     status = camera.status()
     camera.stop()

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import cast
 
 from escape_hw.api.discovery import DiscoveredDevice, Discoverer
-from escape_hw.runtime.host.computer import Host, SerialLine, UsbDevice
+from escape_hw.runtime.host.computer import Host, UsbDevice
 
 GROUP = "escape.discover"
 #: Kind, driver and section of USB devices, by vendor number.
@@ -28,12 +28,7 @@ _ALPAO_VARIABLES = ("ACECFG", "ACEROOT")
 def discover(hosts: Sequence[str] = (), host: Host | None = None) -> list[DiscoveredDevice]:
     """Devices on USB, on serial lines, with ALPAO files, and those that drivers find on the given hosts.
 
-    Parameters
-    ----------
-    hosts
-        Network hosts to query, ``name`` or ``name:port``; the network is never scanned.
-    host
-        The computer; this one by default.
+    ``hosts`` are queried as ``name`` or ``name:port``; the network is never scanned.
     """
     host = host or Host()
     found = [*_find_usb(host), *_find_serial(host), *_find_alpao(host)]
@@ -53,12 +48,9 @@ def _find_usb(host: Host) -> Iterator[DiscoveredDevice]:
 def _find_serial(host: Host) -> Iterator[DiscoveredDevice]:
     for line in host.serial_lines():
         if line.usb.vendor in _SERIAL:
-            yield _describe(host, "modulator", "pi-e727", "modulator", line.usb, line.path, _line_toml(line))
-
-
-def _line_toml(line: SerialLine) -> str:
-    stable = f"/dev/escape/serial-{line.usb.serial}" if line.usb.serial else line.path
-    return f'\n\n[devices.modulator.wire]\nkind = "serial"\nserial_port = "{stable}"'
+            stable = f"/dev/escape/serial-{line.usb.serial}" if line.usb.serial else line.path
+            wire = f'\n\n[devices.modulator.wire]\nkind = "serial"\nserial_port = "{stable}"'
+            yield _describe(host, "modulator", "pi-e727", "modulator", line.usb, line.path, wire)
 
 
 def _describe(

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
-import ctypes.util
 import importlib.metadata
 import os
 import re
@@ -11,20 +9,20 @@ import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, cast
+from typing import TYPE_CHECKING, Literal
 
 from escape_hw.errors import ConfigError
 from escape_hw.runtime.host import udev
 from escape_hw.runtime.host.computer import Host, route_to, user_name
 
 if TYPE_CHECKING:
-    from escape_hw.api.discovery import NativeLibrary
+    from escape_hw.api.discovery import VendorLibrary
     from escape_hw.config.devices import DeviceConfig
     from escape_hw.config.system import SystemConfig
 
 Level = Literal["ok", "info", "warning", "error"]
 
-#: Entry points of vendor libraries, by driver (:class:`~escape_hw.api.discovery.NativeLibrary`).
+#: Entry points of vendor libraries, by driver (:class:`~escape_hw.api.discovery.VendorLibrary`).
 LIBRARIES = "escape.libraries"
 #: Default host and port of devices on the network, by driver.
 DEFAULT_ADDRESSES = {"asm": ("127.0.0.1", 7336)}
@@ -40,18 +38,10 @@ MIN_PRIORITY = 90
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """Result of one check.
+    """Result of one check: what was checked, what was found, and what to do about it (may be empty).
 
-    Parameters
-    ----------
-    item
-        What was checked.
-    level
-        ``ok``, ``info`` (reported only), ``warning`` (works, but not well) or ``error`` (will not work).
-    text
-        What was found.
-    remedy
-        What to do about it; empty for nothing.
+    ``level`` is ``ok``, ``info`` (reported only), ``warning`` (works, but not well) or ``error`` (will not
+    work).
     """
 
     item: str
@@ -65,15 +55,9 @@ def check_computer(
 ) -> list[Finding]:
     """Check packages, vendor libraries, permissions, USB, serial lines, processor, network and disk.
 
-    Parameters
-    ----------
-    config
-        A system: missing needs of its real devices are errors. Without one every driver is checked, and
-        missing libraries are only reported.
-    host
-        The computer; this one by default.
-    data
-        Folder for products; the user's data folder by default.
+    With a configuration, missing needs of the system's real devices are errors. Without one, every driver is
+    checked, and missing libraries are only reported. ``data`` is the folder for products, by default the
+    user's.
     """
     host = host or Host()
     hardware = _hardware_sections(config)
@@ -132,29 +116,18 @@ def _check_libraries(hardware: dict[str, DeviceConfig] | None) -> Iterator[Findi
         driver = entry.name
         if hardware is not None and driver not in hardware:
             continue
-        library = cast("NativeLibrary", entry.load())
+        library: VendorLibrary = entry.load()
         option = "" if hardware is None else str(hardware[driver].options.get("library", ""))
-        chosen = option or os.environ.get(library.variable, "")
-        found, failures = _load_first((chosen,) if chosen else library.default)
-        if found:
+        try:
+            found = _loaded_file(str(vars(library.load(option))["_name"]))
+        except OSError as error:
+            failures = error
+        else:
             yield Finding(library.title, "ok", f"{found} (driver '{driver}')")
             continue
         remedy = f"{library.source}; or set {library.variable}, or options.library in its section, to a path"
         level: Level = "info" if hardware is None else "error"
         yield Finding(library.title, level, f"driver '{driver}' cannot load it ({failures})", remedy)
-
-
-def _load_first(names: tuple[str, ...]) -> tuple[str, str]:
-    """The first file that could be loaded, and the errors of the others."""
-    failures = []
-    for name in names:
-        try:
-            ctypes.CDLL(name)
-        except OSError as error:
-            failures.append(str(error))
-        else:
-            return _loaded_file(name), ""
-    return "", "; ".join(failures)
 
 
 def _loaded_file(name: str) -> str:

@@ -15,12 +15,7 @@ from escape_hw.api.concurrency import disable_helper_threads
 def open_process_pool(count: int, *, helper_threads: bool = False) -> ProcessPoolExecutor:
     """A pool of spawned processes that ignore Ctrl-C and exit with this process.
 
-    Parameters
-    ----------
-    count
-        Number of processes.
-    helper_threads
-        Whether simulations may use threads of their own.
+    ``helper_threads`` allows simulations to use threads of their own.
     """
     context = multiprocessing.get_context("spawn")
     return ProcessPoolExecutor(

@@ -168,27 +168,22 @@ class CalibrationProcedure(ProcedureSpec["CalibrationResult"]):
     ) -> SavedRun:
         """Save the matrix, the measured matrix behind a pseudo-synthetic one, and the report."""
         from escape_hw.io.documents import calibration_document
-        from escape_hw.runtime.procedures.products import add_calibration, write_run_result
+        from escape_hw.runtime.procedures.products import add_result, save_run
 
         measured = measured_calibration(result)
         labels: dict[str, Any] = {"im": {"measured": "DO-CRIME", "column": ""}}
-        parents = {} if self._control_matrix is None else {"closing": self._control_matrix.path}
+        parents = () if self._control_matrix is None else (self._control_matrix.path,)
         if measured is not None:
-            parents = {"docrime": add_calibration(folder, record, "docrime", measured, parents)}
+            parents = (add_result(folder, record, "docrime", measured, *parents),)
             labels["docrime"] = {"label": "DO-CRIME"}
-        add_calibration(folder, record, "im", result, parents)
+        add_result(folder, record, "im", result, *parents)
         checks = self._criteria(result)
-        document = write_run_result(
-            folder,
-            {
-                **record.header_fields("calibrate"),
-                "title": f"Calibration of {record.system}",
-                **calibration_document(result),
-                "criteria": checks,
-                "labels": labels,
-                **record.footer_fields(wall_seconds),
-            },
-        )
+        document = save_run(
+            folder, record, "calibrate", f"Calibration of {record.system}", wall_seconds,
+            **calibration_document(result),
+            criteria=checks,
+            labels=labels,
+        )  # fmt: skip
         return SavedRun(document, all(entry["met"] for entry in checks))
 
     def _criteria(self, result: CalibrationResult) -> list[dict[str, Any]]:
@@ -403,26 +398,12 @@ def calibrate_with_method(
     until: Target | None = None,
     checkpoint: Checkpoint | None = None,
 ) -> Procedure[CalibrationResult]:
-    """Calibrate with the method of that name.
+    """Calibrate with one of :data:`METHODS`; during push-pull a movable phase screen is out of the beam.
 
-    During push-pull the phase screen, if the bench can move it, is out of the beam.
-
-    Parameters
-    ----------
-    bench
-        An open bench.
-    method
-        One of :data:`METHODS`.
-    frames, poke, whiten, estimator
-        See the parameters of the procedure, for example :class:`EscapeProcedure`.
-    grid
-        Geometry of the sensor; found on frames by default.
-    closed_loop
-        Calibration whose matrix closes the loop during the measurement; methods of :data:`CLOSED_LOOP`.
-    until
-        Stop when this target is reached.
-    checkpoint
-        File for the state of the run, and the state to resume from.
+    ``frames``, ``poke``, ``whiten`` and ``estimator`` are parameters of the procedures, see for example
+    :class:`EscapeProcedure`. The matrix of ``closed_loop`` closes the loop during the measurement, with a
+    method of :data:`CLOSED_LOOP`. The sensor geometry ``grid`` is found on frames by default, ``until`` ends
+    the run at a target, ``checkpoint`` is the file for its state and the state to resume from.
 
     Raises
     ------

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from escape_hw.api.optical_gains import GainsResult
+from escape_hw.api.optical_gains import GainsResult, OpticalGains
 from escape_hw.api.procedure import Procedure
 from escape_hw.api.representation import short_repr
 from escape_hw.api.results import CalibrationResult, LoopResult
 from escape_hw.bench import Bench
-from escape_hw.runtime.procedures.calibration import calibrate_with_method
+from escape_hw.runtime.procedures.calibration import calibrate_with_method, measured_calibration
 from escape_hw.runtime.procedures.model_psf import model_psf
 
 #: Suffix of a matrix's label when the matrix is scaled by its optical gains.
@@ -45,29 +45,14 @@ class CalibrationComparison:
     __repr__ = short_repr
 
 
-def measured_calibration(result: CalibrationResult) -> CalibrationResult | None:
-    """The DO-CRIME matrix behind an ESCAPE matrix as a calibration of its own."""
-    if result.measured is None:
-        return None
-    return replace(result, matrix=result.measured, measured=None, registration=None, notes=())
-
-
 def measure_matrices(
     bench: Bench, frames: int, result: CalibrationComparison, *, common_geometry: bool = False
 ) -> Procedure[None]:
-    """Add the calibrations "push-pull", "DO-CRIME" and "ESCAPE", the latter two from the same frames.
+    """Add the calibrations "push-pull", "DO-CRIME" and "ESCAPE", the latter two from the same ``frames``.
 
-    Parameters
-    ----------
-    bench
-        An open bench.
-    frames
-        Frames of the DO-CRIME measurement.
-    result
-        Takes the calibrations; ``partial`` is set when one of them was stopped.
-    common_geometry
-        Measure push-pull last, with the sensor geometry of ESCAPE, so that the matrices differ in nothing
-        else; otherwise first, with a geometry of its own.
+    With ``common_geometry``, push-pull is measured last, with the sensor geometry of ESCAPE, so that the
+    matrices differ in nothing else; otherwise first, with a geometry of its own. ``result.partial`` is set
+    when one of them was stopped.
     """
     if not common_geometry:
         baseline = yield from calibrate_with_method(bench, "push-pull")
@@ -94,16 +79,8 @@ def measure_optical_gains(
 ) -> Procedure[tuple[CalibrationResult, NDArray[np.float32]]]:
     """Add the optical gains of all matrices, measured in closed loop with ESCAPE's.
 
-    Parameters
-    ----------
-    bench
-        An open bench with a science camera.
-    frames
-        Frames per round at most.
-    result
-        With the matrices; takes the gains, and ``partial`` when the measurement was stopped.
-    accuracy
-        Relative standard error of the gains at which the measurement stops.
+    A round takes at most ``frames``; the measurement ends at the relative standard error ``accuracy``.
+    ``result.partial`` is set when it was stopped. The bench needs a science camera.
 
     Returns
     -------
@@ -131,9 +108,6 @@ def with_and_without_optical_gains(
     known: Mapping[str, CalibrationResult], result: CalibrationComparison
 ) -> Iterator[tuple[str, CalibrationResult]]:
     """Each matrix unscaled and scaled by its optical gains, with its label."""
-    from escape_hw.calibration.optical_gain.matrix_comparison import scale_matrix
-    from escape_hw.calibration.optical_gain.smoothing import clip_gains
-
     if result.gains is None or result.gains.gains is None:
         return
     gains_of = {"ESCAPE": result.gains.gains, **result.gains.comparisons}
@@ -141,9 +115,17 @@ def with_and_without_optical_gains(
         yield label, one
         if label == "ESCAPE" and result.rescaled_calibration is not None:
             yield label + WITH_GAINS, result.rescaled_calibration
-            continue
-        scaled = scale_matrix(one.matrix, clip_gains(gains_of[label]), gains_of[label].best_sigma)
-        yield label + WITH_GAINS, replace(one, matrix=scaled, measured=None)
+        else:
+            yield label + WITH_GAINS, scale_by_gains(one, gains_of[label])
+
+
+def scale_by_gains(calibration: CalibrationResult, gains: OpticalGains) -> CalibrationResult:
+    """A calibration with its matrix scaled by its optical gains."""
+    from escape_hw.calibration.optical_gain.matrix_comparison import scale_matrix
+    from escape_hw.calibration.optical_gain.smoothing import clip_gains
+
+    scaled = scale_matrix(calibration.matrix, clip_gains(gains), gains.best_sigma)
+    return replace(calibration, matrix=scaled, measured=None)
 
 
 def close_loop_at_best_gain(
@@ -154,22 +136,9 @@ def close_loop_at_best_gain(
     model: NDArray[np.float32],
     result: CalibrationComparison,
 ) -> Procedure[None]:
-    """Search a matrix's own best gain, close the loop with it, and add both to the result.
+    """Search a matrix's own best gain, close the loop with it, and add both runs to the result.
 
-    Parameters
-    ----------
-    bench
-        An open bench with a science camera.
-    label
-        Name of the matrix in the result.
-    calibration
-        The matrix and its sensor geometry.
-    loop_frames
-        Frames of the loop at the best gain.
-    model
-        PSF to measure Strehl ratios against.
-    result
-        Takes the runs; ``partial`` is set when one of them was stopped.
+    Strehl ratios are measured against ``model``. ``result.partial`` is set when a run was stopped.
 
     Raises
     ------

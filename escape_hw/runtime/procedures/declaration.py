@@ -57,8 +57,22 @@ class Parameter:
         ``run`` (folder of an earlier run).
     default
         Value if absent. ``None``: the value of ``config_key`` or, without a key, no value.
-    required
-        Whether the parameter has no default.
+    help, label
+        One sentence for every interface, and words for the window's form (the name by default).
+    unit, low, high
+        Unit, smallest and largest value of a number.
+    choices
+        The possible values of a text.
+    config_key
+        Key of the system's configuration whose value is the default, such as ``"loop.gain"``.
+    sets_config
+        A given value replaces the value of ``config_key`` in the configuration of the run.
+    on_server
+        Whether a server offers the parameter.
+    last
+        List the parameter after those of derived classes.
+    deprecated, deprecated_inverse
+        Names of earlier versions; the latter belong to booleans of the opposite meaning.
     """
 
     name: str
@@ -81,12 +95,7 @@ class Parameter:
     def check(self, value: Any, label: str = "") -> Any:
         """The value, converted to the type of the parameter; ``None`` if the parameter is absent.
 
-        Parameters
-        ----------
-        value
-            The value as given.
-        label
-            Name of the parameter for messages (default: ``name``).
+        Messages call the parameter ``label``, by default its name.
 
         Raises
         ------
@@ -139,71 +148,19 @@ class Parameter:
         return int(value) if self.kind == "int" else float(value)
 
 
-def parameter(
-    *,
-    default: Any = dataclasses.MISSING,
-    help: str = "",
-    label: str = "",
-    unit: str = "",
-    low: float | None = None,
-    high: float | None = None,
-    choices: tuple[str, ...] = (),
-    kind: str = "",
-    config_key: str = "",
-    sets_config: bool = False,
-    on_server: bool = True,
-    last: bool = False,
-    deprecated: tuple[str, ...] = (),
-    deprecated_inverse: tuple[str, ...] = (),
-) -> Any:
-    """Declare a parameter in the body of a :class:`ProcedureSpec`.
+def parameter(*, default: Any = dataclasses.MISSING, kind: str = "", **attributes: Any) -> Any:
+    """Declare a parameter in the body of a :class:`ProcedureSpec`; without a default it is required.
 
-    Parameters
-    ----------
-    default
-        Value if absent; a parameter without default is required.
-    help
-        One sentence for every interface.
-    label
-        Words for the window's form; the name by default.
-    unit
-        Unit of a number.
-    low, high
-        Smallest and largest value.
-    choices
-        The possible values of a text.
-    kind
-        Kind of the parameter if the annotation does not give it, see :class:`Parameter`.
-    config_key
-        Key of the system's configuration whose value is the default, such as ``"loop.gain"``.
-    sets_config
-        A given value replaces the value of ``config_key`` in the configuration of the run.
-    on_server
-        Whether a server offers the parameter.
-    last
-        List the parameter after those of derived classes.
-    deprecated, deprecated_inverse
-        Names of earlier versions; the latter belong to booleans of the opposite meaning.
+    The attributes are those of :class:`Parameter`. ``kind`` is needed if the annotation does not give it.
     """
-    declared = Parameter(
-        "", kind, None if default is dataclasses.MISSING else default, default is dataclasses.MISSING,
-        help, label, unit, low, high, choices, config_key, sets_config, on_server, last,
-        deprecated, deprecated_inverse,
-    )  # fmt: skip
+    required = default is dataclasses.MISSING
+    declared = Parameter("", kind, None if required else default, required, **attributes)
     return field(default=default, metadata={"parameter": declared})
 
 
 @dataclass(frozen=True, slots=True)
 class SavedRun:
-    """A saved result.
-
-    Parameters
-    ----------
-    document
-        Content of ``result.json``, with absolute paths of the products.
-    met
-        Whether the run met its own criteria.
-    """
+    """Content of ``result.json``, with absolute paths, and whether the run met its own criteria."""
 
     document: dict[str, Any] = field(default_factory=dict)
     met: bool = True
@@ -257,14 +214,7 @@ class ProcedureSpec(ABC, Generic[ResultT]):
 
     @classmethod
     def from_arguments(cls, arguments: Mapping[str, Any], label: Callable[[str], str] = str) -> Self:
-        """A request from arguments by name; ``None`` stands for absent, names of earlier versions count.
-
-        Parameters
-        ----------
-        arguments
-            Values by name.
-        label
-            Spelling of a parameter's name in messages.
+        """A request from arguments by name; see :func:`check_arguments`.
 
         Raises
         ------
@@ -311,12 +261,7 @@ class ProcedureSpec(ABC, Generic[ResultT]):
     def load(self, config: SystemConfig, simulated: bool = False) -> None:
         """Read the files that the run needs, before any device is opened.
 
-        Parameters
-        ----------
-        config
-            The system's configuration.
-        simulated
-            The devices are open already and simulated, whatever the configured mode is.
+        ``simulated``: the devices are open already and simulated, whatever the configured mode is.
 
         Raises
         ------
@@ -328,14 +273,9 @@ class ProcedureSpec(ABC, Generic[ResultT]):
 
     @abstractmethod
     def procedure(self, bench: Bench, folder: RunFolder | None) -> Procedure[ResultT]:
-        """The generator that does the work.
+        """The generator that does the work, on an open bench with the configuration given to :meth:`load`.
 
-        Parameters
-        ----------
-        bench
-            An open bench with the configuration given to :meth:`load`.
-        folder
-            Folder for intermediate files; ``None``: the run leaves none.
+        Intermediate files go to ``folder``; without one the run leaves none.
 
         Raises
         ------
@@ -425,14 +365,8 @@ def check_arguments(
 ) -> dict[str, Any]:
     """A value for every parameter: the one given, or the default.
 
-    Parameters
-    ----------
-    parameters
-        The declared parameters.
-    arguments
-        Values by name, also by names of earlier versions; ``None`` stands for absent.
-    label
-        Spelling of a parameter's name in messages.
+    Arguments may have names of earlier versions; ``None`` stands for absent. ``label`` spells the name of a
+    parameter for messages.
 
     Raises
     ------

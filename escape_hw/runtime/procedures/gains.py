@@ -15,12 +15,10 @@ from escape_hw.runtime.procedures.matrix_input import (
 )
 
 if TYPE_CHECKING:
-    from escape_hw.api.interaction_matrix import InteractionMatrix
     from escape_hw.api.procedure import Procedure
     from escape_hw.bench import Bench
     from escape_hw.calibration.optical_gain.bootstrap import GainsRun
     from escape_hw.config.system import SystemConfig
-    from escape_hw.io.fits.matrix import MatrixProduct
     from escape_hw.io.run_folder import RunFolder
     from escape_hw.runtime.session.record import BenchRecord
 
@@ -61,10 +59,6 @@ class GainsProcedure(MatrixProcedure["GainsRun"]):
         on_server=False, deprecated=("beside",),
     )  # fmt: skip
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self._other_products: dict[str, MatrixProduct] = {}
-
     @classmethod
     def planned_frames(cls, bench: Bench, arguments: Mapping[str, Any]) -> int:
         """Sensor frames of the model PSF and of a typical number of rounds."""
@@ -73,9 +67,9 @@ class GainsProcedure(MatrixProcedure["GainsRun"]):
     def load(self, config: SystemConfig, simulated: bool = False) -> None:
         """Read all matrices."""
         super().load(config, simulated)
-        any_mode = self.force or simulated
         self._other_products = {
-            path.stem: load_fitting_matrix(path, config, any_mode) for path in self.other_matrices
+            path.stem: load_fitting_matrix(path, config, self.force or simulated)
+            for path in self.other_matrices
         }
 
     def procedure(self, bench: Bench, folder: RunFolder | None) -> Procedure[GainsRun]:
@@ -86,51 +80,35 @@ class GainsProcedure(MatrixProcedure["GainsRun"]):
         for each in (self.product, *self._other_products.values()):
             require_hardware_matrix(each, bench, self.force)
         model = yield from self.take_model_psf(bench)
+        # Of a pseudo-synthetic matrix, also the gains of the measured one behind it.
+        measured = self.product.result.measured
+        comparisons = {} if measured is None else {"DO-CRIME": measured}
+        comparisons |= {name: each.matrix for name, each in self._other_products.items()}
         return (
             yield from bootstrap_gains(
-                bench,
-                self.product.result,
-                poke=self.poke,
-                accuracy=self.accuracy,
-                allowed_strehl_loss=self.allowed_strehl_loss,
-                frames=self.frames,
-                gain=self.gain,
-                comparisons=self._comparison_matrices(),
-                closed_loop_matrix=static_light_matrix(bench, self.product.result),
+                bench, self.product.result, poke=self.poke, accuracy=self.accuracy,
+                allowed_strehl_loss=self.allowed_strehl_loss, frames=self.frames, gain=self.gain,
+                comparisons=comparisons, closed_loop_matrix=static_light_matrix(bench, self.product.result),
                 model_psf=model,
             )
-        )
-
-    def _comparison_matrices(self) -> dict[str, InteractionMatrix]:
-        """The other matrices and, for a pseudo-synthetic matrix, the measured one behind it."""
-        measured = self.product.result.measured
-        known = {} if measured is None else {"DO-CRIME": measured}
-        return {**known, **{name: each.matrix for name, each in self._other_products.items()}}
+        )  # fmt: skip
 
     def save(self, folder: RunFolder, record: BenchRecord, result: GainsRun, wall_seconds: float) -> SavedRun:
         """Save gains, rescaled matrix and report."""
         from escape_hw.io.documents import gains_document
         from escape_hw.runtime.procedures import criteria
-        from escape_hw.runtime.procedures.products import add_calibration, add_gains, write_run_result
+        from escape_hw.runtime.procedures.products import add_result, save_run
 
         found = result.result
-        parents = {
-            "im": self.product.path,
-            **{name: each.path for name, each in self._other_products.items()},
-        }
-        add_gains(folder, record, "gains", found, parents)
+        others = [each.path for each in self._other_products.values()]
+        add_result(folder, record, "gains", found, self.product.path, *others)
         if found.rounds:
-            add_calibration(folder, record, "im", result.rescaled_calibration, {"im": self.product.path})
-        document = write_run_result(
-            folder,
-            {
-                **record.header_fields("gains"),
-                "title": f"Optical gains of {record.system}",
-                **gains_document(found),
-                "im": self.product.path.absolute(),
-                "criteria": [] if found.partial else [criteria.gains_converged(found)],
-                "labels": {"im": {"label": "rescaled", "column": ""}},
-                **record.footer_fields(wall_seconds),
-            },
-        )
+            add_result(folder, record, "im", result.rescaled_calibration, self.product.path)
+        document = save_run(
+            folder, record, "gains", f"Optical gains of {record.system}", wall_seconds,
+            **gains_document(found),
+            im=self.product.path.absolute(),
+            criteria=[] if found.partial else [criteria.gains_converged(found)],
+            labels={"im": {"label": "rescaled", "column": ""}},
+        )  # fmt: skip
         return SavedRun(document, found.converged)

@@ -86,22 +86,17 @@ class LoopProcedure(MatrixProcedure["LoopResult"]):
         from escape_hw.io.documents import loop_document
         from escape_hw.report.tables import METHOD_LABELS
         from escape_hw.runtime.procedures import criteria
-        from escape_hw.runtime.procedures.products import add_loop, add_telemetry, write_run_result
+        from escape_hw.runtime.procedures.products import add_result, save_run
 
         label = METHOD_LABELS.get(result.method, result.method)
         if self._recorder is not None:
-            add_telemetry(folder, record, "telemetry", self._recorder.to_telemetry(), self.product.path)
-        add_loop(folder, record, "loop", result, self.product.path)
-        document = write_run_result(
-            folder,
-            {
-                **record.header_fields("loop"),
-                "title": f"Closed loop on {record.system}",
-                **loop_document(result),
-                "im": self.product.path.absolute(),
-                "criteria": [] if result.partial else criteria.loop_criteria({label: result}),
-                "labels": {"loop": {"label": label}},
-                **record.footer_fields(wall_seconds),
-            },
-        )
+            add_result(folder, record, "telemetry", self._recorder.to_telemetry(), self.product.path)
+        add_result(folder, record, "loop", result, self.product.path)
+        document = save_run(
+            folder, record, "loop", f"Closed loop on {record.system}", wall_seconds,
+            **loop_document(result),
+            im=self.product.path.absolute(),
+            criteria=[] if result.partial else criteria.loop_criteria({label: result}),
+            labels={"loop": {"label": label}},
+        )  # fmt: skip
         return SavedRun(document, result.stable)

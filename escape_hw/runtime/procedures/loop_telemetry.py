@@ -11,16 +11,9 @@ from escape_hw.io.fits.telemetry import LoopTelemetry
 
 
 class LoopTelemetryRecorder:
-    """Keeps slopes and commands of the last frames in memory.
+    """Keeps slopes and commands of the last ``frames`` frames in memory.
 
     A frame without a command of its own is stored with the command before it.
-
-    Parameters
-    ----------
-    frames
-        Number of frames to keep.
-    n_slopes, n_act
-        Number of slopes and actuators.
     """
 
     def __init__(self, frames: int, n_slopes: int, n_act: int) -> None:

@@ -73,20 +73,9 @@ class MatrixProcedure(ProcedureSpec[ResultT]):
         default=False, help="Allow a simulated matrix on hardware.", on_server=False, last=True
     )
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self._product: MatrixProduct | None = None
-
-    @property
-    def product(self) -> MatrixProduct:
-        """The matrix; set by :meth:`load`."""
-        if self._product is None:
-            raise RuntimeError("load() has not been called")
-        return self._product
-
     def load(self, config: SystemConfig, simulated: bool = False) -> None:
         """Read the matrix."""
-        self._product = load_fitting_matrix(self.im, config, self.force or simulated)
+        self.product = load_fitting_matrix(self.im, config, self.force or simulated)
 
     def take_model_psf(self, bench: Bench) -> Procedure[NDArray[np.float32] | None]:
         """Measure the model PSF; ``None`` without a science camera or if Strehl ratios are not wanted."""

@@ -23,13 +23,6 @@ MODEL_PSF_FRAMES = 20
 def model_psf(bench: Bench, *, frames: int = MODEL_PSF_FRAMES) -> Procedure[NDArray[np.float32]]:
     """Measure the model PSF, the reference of Strehl ratios, with the phase screen out of the beam.
 
-    Parameters
-    ----------
-    bench
-        An open bench with a science camera.
-    frames
-        Science frames to average.
-
     Raises
     ------
     CalibrationError

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ from escape_hw.io.fits.gains import save_gains
 from escape_hw.io.fits.loop import save_loop
 from escape_hw.io.fits.matrix import save_matrix
 from escape_hw.io.fits.telemetry import LoopTelemetry, save_telemetry
-from escape_hw.io.provenance import file_sha256
+from escape_hw.io.provenance import file_sha256, format_utc
 from escape_hw.io.run_folder import RunFolder
 from escape_hw.report.run_report import REPORT, write_report
 from escape_hw.runtime.procedures.declaration import SavedRun
@@ -25,69 +25,39 @@ def product_key(label: str) -> str:
     return re.sub(r"[^a-z0-9]+", "_", label.lower().replace("do-crime", "docrime")).strip("_")
 
 
-def _checksums(parents: Iterable[Path]) -> dict[str, str]:
-    return {path.name: file_sha256(path) for path in parents}
+_SAVE: dict[type, Callable[..., Path]] = {
+    LoopResult: save_loop, LoopTelemetry: save_telemetry, GainsResult: save_gains
+}  # fmt: skip
 
 
-def add_calibration(
+def add_result(
     folder: RunFolder,
     record: BenchRecord,
     name: str,
-    result: CalibrationResult,
-    parents: Mapping[str, Path] | None = None,
+    result: CalibrationResult | LoopResult | LoopTelemetry | GainsResult,
+    *parents: Path,
 ) -> Path:
-    """Save a calibration as ``NAME.fits`` and list it among the products.
+    """Save a result as ``NAME.fits``, with the files it was made from, and list it among the products.
 
     Raises
     ------
     StorageError
-        The file cannot be written; as for the other functions of this module.
+        The file cannot be written.
     """
-    origin = record.origin(_checksums((parents or {}).values()))
-    return folder.add_product(name, save_matrix(folder.file(f"{name}.fits"), result, origin))
-
-
-def add_loop(
-    folder: RunFolder, record: BenchRecord, name: str, result: LoopResult, matrix: Path | None = None
-) -> Path:
-    """Save a closed-loop run as ``NAME.fits``, with its control matrix as parent."""
-    origin = record.origin(_checksums([] if matrix is None else [matrix]))
-    path = folder.file(f"{name}.fits")
-    return folder.add_product(name, save_loop(path, result, record.system, record.simulated, origin))
-
-
-def add_telemetry(
-    folder: RunFolder, record: BenchRecord, name: str, telemetry: LoopTelemetry, matrix: Path
-) -> Path:
-    """Save a loop's telemetry as ``NAME.fits``, with its control matrix as parent."""
-    origin, path = record.origin(_checksums([matrix])), folder.file(f"{name}.fits")
-    return folder.add_product(name, save_telemetry(path, telemetry, record.system, record.simulated, origin))
-
-
-def add_gains(
-    folder: RunFolder, record: BenchRecord, name: str, result: GainsResult, parents: Mapping[str, Path]
-) -> Path:
-    """Save optical gains as ``NAME.fits``, with the matrices used as parents."""
-    origin, path = record.origin(_checksums(parents.values())), folder.file(f"{name}.fits")
-    return folder.add_product(name, save_gains(path, result, record.system, record.simulated, origin))
-
-
-def write_run_result(folder: RunFolder, document: Mapping[str, Any]) -> dict[str, Any]:
-    """Write ``result.json``, build the report, and return the document with the paths of the products.
-
-    An aborted run gets no report, because that takes seconds; ``escape report`` builds it.
-    """
-    if document.get("partial"):
-        folder.write_result(document)
+    path, origin = folder.file(f"{name}.fits"), record.origin({one.name: file_sha256(one) for one in parents})
+    # A partial result is saved under a name that says so.
+    if isinstance(result, CalibrationResult):
+        saved = save_matrix(path, result, origin)
     else:
-        folder.add_product("report", folder.file(REPORT))
-        folder.write_result(document)
-        write_report(folder.path)
-    return {
-        **document,
-        **folder.location_fields(),
-        "products": {k: str(v) for k, v in folder.products.items()},
-    }
+        saved = _SAVE[type(result)](path, result, record.system, record.simulated, origin)
+    return folder.add_product(name, saved)
+
+
+def save_run(
+    folder: RunFolder, record: BenchRecord, command: str, title: str, wall_seconds: float, **content: Any
+) -> dict[str, Any]:
+    """Save a run on a bench as :func:`write_run_result`, with ``content`` between header and footer."""
+    return write_run_result(folder, _document(record, command, title, wall_seconds, content))
 
 
 def save_values(
@@ -98,30 +68,29 @@ def save_values(
     values: Mapping[str, Any],
     wall_seconds: float,
 ) -> SavedRun:
-    """Save a result that consists of a few numbers, without products and report.
-
-    Parameters
-    ----------
-    folder
-        The run folder.
-    record
-        The bench.
-    name
-        Name of the procedure.
-    title
-        Heading of the result.
-    values
-        The numbers, as they appear in ``result.json`` and with ``--json``.
-    wall_seconds
-        Duration of the run.
-    """
-    document = {
-        **record.header_fields(name),
-        "title": title,
-        **values,
-        "partial": False,
-        "products": {},
-        **record.footer_fields(wall_seconds),
-    }
+    """Save a result that consists of a few numbers, by their names, without products and report."""
+    content = {**values, "partial": False, "products": {}}
+    document = _document(record, name, title, wall_seconds, content)
     folder.write_result(document)
     return SavedRun({**document, **folder.location_fields()})
+
+
+def _document(
+    record: BenchRecord, command: str, title: str, wall_seconds: float, content: Mapping[str, Any]
+) -> dict[str, Any]:
+    header = {**record.header_fields(command), "title": title}
+    return {**header, **content, "finished_utc": format_utc(), "wall_seconds": wall_seconds}
+
+
+def write_run_result(folder: RunFolder, document: Mapping[str, Any]) -> dict[str, Any]:
+    """Write ``result.json``, build the report, and return the document with the paths of the products.
+
+    An aborted run gets no report, because that takes seconds; ``escape report`` builds it.
+    """
+    if not document.get("partial"):
+        folder.add_product("report", folder.file(REPORT))
+    folder.write_result(document)
+    if not document.get("partial"):
+        write_report(folder.path)
+    products = {name: str(path) for name, path in folder.products.items()}
+    return {**document, **folder.location_fields(), "products": products}

@@ -21,15 +21,9 @@ def procedure_method(
 ) -> Callable[[Callable[P, T]], Callable[P, T]]:
     """Decorate a method that runs one of these procedures.
 
-    Parameters with a declared name are documented by the declaration and accept the names of earlier
-    versions. The others exist in Python only; ``progress`` shows a bar.
-
-    Parameters
-    ----------
-    procedures
-        The procedures; the first one that has a parameter describes it.
-    renamed
-        Earlier names of parameters that exist in Python only, old -> new.
+    Parameters with a declared name are documented by the declaration (of the first procedure that has one)
+    and accept the names of earlier versions. The others exist in Python only, with earlier names in
+    ``renamed``, old -> new; ``progress`` shows a bar.
     """
     declared: dict[str, Parameter] = {}
     for procedure in procedures:

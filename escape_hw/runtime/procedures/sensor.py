@@ -39,10 +39,6 @@ class SensorProcedure(ProcedureSpec["SensorSetup"]):
         from escape_hw.runtime.procedures.products import save_values
 
         grid = result.grid
-        values = {
-            "n_sub_apertures": grid.n_valid,
-            "counts": grid.counts,
-            "background": grid.background,
-        }
         title = f"Sensor of {record.system}"
+        values = {"n_sub_apertures": grid.n_valid, "counts": grid.counts, "background": grid.background}
         return save_values(folder, record, self.name, title, values, wall_seconds)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
@@ -14,7 +15,6 @@ if TYPE_CHECKING:
     from escape_hw.api.results import CalibrationResult
     from escape_hw.api.synthetic_model import SyntheticModel
     from escape_hw.config.system import SystemConfig
-    from escape_hw.io.fits.matrix import MatrixProduct
     from escape_hw.io.run_folder import RunFolder
 
 ResultT = TypeVar("ResultT")
@@ -55,18 +55,6 @@ class SprintProcedure(ComputedProcedure["CalibrationResult"], SprintParameters["
         label="Matrix", kind="matrix",
     )  # fmt: skip
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self._config: SystemConfig | None = None
-        self._product: MatrixProduct | None = None
-        self._model: SyntheticModel | None = None
-
-    @property
-    def _inputs(self) -> tuple[SystemConfig, MatrixProduct]:
-        if self._config is None or self._product is None:
-            raise RuntimeError("load() has not been called")
-        return self._config, self._product
-
     def load(self, config: SystemConfig, simulated: bool = False) -> None:
         """Read the matrix; number of modes, basis and mode may differ from the configuration."""
         from escape_hw.io.fits.matrix import load_matrix
@@ -84,26 +72,23 @@ class SprintProcedure(ComputedProcedure["CalibrationResult"], SprintParameters["
         from escape_hw.api.procedure import Reporter
         from escape_hw.calibration.sprint.fit import estimate_registration, sprint_options_from_config
 
-        config, product = self._inputs
-        settings = config.calibration
+        product, settings = self._product, self._config.calibration
         measured = product.result.measured or product.matrix
         yield Reporter("synthetic model", 1, "model")(0)
         estimate = yield from estimate_registration(
             measured,
-            self._synthetic_model(),
+            self._synthetic_model,
             modes=min(settings.sprint_modes, measured.n_modes),
             **sprint_options_from_config(settings),
         )
         return replace(product.result, matrix=measured, measured=None, registration=estimate)
 
+    @cached_property
     def _synthetic_model(self) -> SyntheticModel:
         """The synthetic model; building that of a pyramid takes seconds."""
         from escape_hw.config.registry import model_factory
 
-        if self._model is None:
-            config, product = self._inputs
-            self._model = model_factory(config.calibration.model)(config, product.grid)
-        return self._model
+        return model_factory(self._config.calibration.model)(self._config, self._product.grid)
 
     def save_computed(self, folder: RunFolder, result: CalibrationResult, wall_seconds: float) -> SavedRun:
         """Save the measured matrix with its registration, the synthetic matrix, and the report."""
@@ -115,13 +100,13 @@ class SprintProcedure(ComputedProcedure["CalibrationResult"], SprintParameters["
         from escape_hw.runtime.procedures.products import write_run_result
         from escape_hw.runtime.session.record import config_provenance
 
-        config, product = self._inputs
+        config, product = self._config, self._product
         estimate, measured, name = result.registration, result.matrix, product.path.name
         if estimate is None:
             raise RuntimeError("a fit without a registration")
         origin = replace(config_provenance(config), parents={name: product.sha256})
         folder.add_product("im", save_matrix(folder.file("im.fits"), result, origin))
-        synthetic = synthesise_from_measurement(result, self._synthetic_model(), estimate)
+        synthetic = synthesise_from_measurement(result, self._synthetic_model, estimate)
         folder.add_product("escape", save_matrix(folder.file("escape.fits"), synthetic, origin))
         document = write_run_result(
             folder,

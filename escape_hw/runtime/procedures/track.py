@@ -84,50 +84,35 @@ class TrackProcedure(MatrixProcedure["TrackResult"]):
     ) -> SavedRun:
         """Save the time series, the last matrix and the report."""
         from escape_hw.io.documents import track_document
-        from escape_hw.runtime.procedures.products import add_calibration, write_run_result
+        from escape_hw.runtime.procedures.products import add_result, save_run
 
         folder.add_product("table", folder.write_text("track.csv", result.to_csv()))
         if result.latest is not None:
-            add_calibration(folder, record, "im", result.latest, {"im": self.product.path})
+            add_result(folder, record, "im", result.latest, self.product.path)
         track = track_document(result)
         injected = injected_registration(self._config) if record.simulated else None
         began, end = result.start_ns * 1e-9, result.rows["seconds"][-1:]
-        document = write_run_result(
-            folder,
-            {
-                **record.header_fields("track"),
-                "title": f"Tracking {record.system}",
-                **track,
-                "injected_course": None
-                if injected is None
-                else injected.trajectory(began, track["track"]["seconds"]),
-                # The truth where the track ends, beside its registration there.
-                "injected_end": None
-                if injected is None or not end
-                else injected.at(began + end[0]).to_dict(),
-                "injected_note": INJECTED_UNKNOWN if record.simulated and injected is None else "",
-                "im": self.product.path.absolute(),
-                "criteria": [
-                    {"text": "loop stable", "met": result.stable},
-                    {"text": f"no alarms ({len(result.alarms)})", "met": not result.alarms},
-                ],
-                **record.footer_fields(wall_seconds),
-            },
-        )
+        document = save_run(
+            folder, record, "track", f"Tracking {record.system}", wall_seconds,
+            **track,
+            injected_course=None
+            if injected is None
+            else injected.trajectory(began, track["track"]["seconds"]),
+            # The truth where the track ends, beside its registration there.
+            injected_end=None if injected is None or not end else injected.at(began + end[0]).to_dict(),
+            injected_note=INJECTED_UNKNOWN if record.simulated and injected is None else "",
+            im=self.product.path.absolute(),
+            criteria=[
+                {"text": "loop stable", "met": result.stable},
+                {"text": f"no alarms ({len(result.alarms)})", "met": not result.alarms},
+            ],
+        )  # fmt: skip
         return SavedRun(document, result.stable and not result.alarms)
 
 
 @dataclass(frozen=True, slots=True)
 class InjectedRegistration:
-    """Injected registration of a twin over time; for reports only.
-
-    Parameters
-    ----------
-    start
-        Registration at time zero of the twin's clock.
-    drift
-        Change with time.
-    """
+    """Injected registration of a twin over time, from its start by the drift; for reports only."""
 
     start: Registration
     drift: TwinDrift

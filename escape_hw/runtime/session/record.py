@@ -78,10 +78,6 @@ class BenchRecord:
             },
         }
 
-    def footer_fields(self, wall_seconds: float) -> dict[str, Any]:
-        """What the run's document ends with."""
-        return {"finished_utc": format_utc(), "wall_seconds": wall_seconds}
-
 
 def config_provenance(config: SystemConfig) -> Provenance:
     """Provenance of a product computed from a configuration alone, with nothing opened."""

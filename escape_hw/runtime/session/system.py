@@ -137,8 +137,6 @@ class System(Bench):
         ------
         IncompatibleProduct
             The matrix belongs to another mirror or grid.
-        Aborted
-            Stopped by Ctrl-C.
         """
         from escape_hw.calibration.loop.performance import close_loop
 
@@ -183,8 +181,6 @@ class System(Bench):
         ------
         CalibrationError
             The loop is not stable with any of the gains.
-        Aborted
-            Stopped by Ctrl-C.
         """
         from escape_hw.calibration.loop.gain_search import find_best_gain
 
@@ -223,8 +219,6 @@ class System(Bench):
         ------
         CalibrationError
             The loop cannot be closed, or diverges; the message says why.
-        Aborted
-            Stopped by Ctrl-C.
         """
         from escape_hw.calibration.optical_gain.bootstrap import bootstrap_gains
         from escape_hw.calibration.sprint.synthetic_matrix import static_light_matrix
@@ -339,8 +333,6 @@ class System(Bench):
         IncompatibleProduct, CalibrationError
             The matrix belongs to another system, cannot be inverted, or holds no registration; nothing has
             moved.
-        Aborted
-            Stopped by Ctrl-C.
         """
         from escape_hw.calibration.tracking.tracker import track
 
@@ -424,8 +416,6 @@ class System(Bench):
             The method is unknown, or arguments exclude each other.
         TooFewFrames, CalibrationError
             The frames cannot constrain the matrix, or the sensor gets no light.
-        Aborted
-            Stopped by Ctrl-C.
         """
         from escape_hw.runtime.procedures.calibration import calibrate_with_method
 

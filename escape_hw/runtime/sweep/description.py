@@ -27,18 +27,9 @@ DESCRIPTION_FILE = "sweep.json"
 
 @dataclass(frozen=True, slots=True)
 class SweepDescription:
-    """A sweep and where its trials are stored.
+    """A sweep, URL and name of the study with its trials, and sampler (``"random"`` or ``"tpe"``).
 
-    Parameters
-    ----------
-    sweep
-        What is swept.
-    storage, study
-        URL and name of the study.
-    sampler
-        ``"random"`` or ``"tpe"``.
-    margin
-        Largest difference in the Strehl ratio that counts as equivalent.
+    ``margin`` is the largest difference in the Strehl ratio that counts as equivalent.
     """
 
     sweep: Sweep
@@ -131,16 +122,8 @@ def describe_sweep(
 ) -> Procedure[SweepDescription]:
     """Describe a new sweep, and save its model PSF in the folder if all loops can share one.
 
-    Parameters
-    ----------
-    bench
-        An open bench.
-    folder
-        Of the sweep.
-    variants, space, design, frames, metric
-        See :class:`~escape_hw.runtime.sweep.design.Sweep`.
-    sampler, margin, storage, study
-        See :class:`SweepDescription`; an SQLite file in the folder by default.
+    See :class:`~escape_hw.runtime.sweep.design.Sweep` and :class:`SweepDescription`; by default the storage
+    is an SQLite file in the folder.
 
     Raises
     ------
@@ -173,14 +156,7 @@ def _check_limits(sweep: Sweep, parameter: Parameter) -> None:
 
 
 def read_description(folder: Path, storage: str | None = None) -> SweepDescription:
-    """Read the description of a sweep.
-
-    Parameters
-    ----------
-    folder
-        Of the sweep.
-    storage
-        URL of the study instead of the stored one, which lacks its password.
+    """Read the description of a sweep; ``storage`` replaces the stored URL, which lacks its password.
 
     Raises
     ------

@@ -50,18 +50,10 @@ class MatrixVariant:
 
 @dataclass(frozen=True, slots=True)
 class Slot:
-    """Place of one loop in the design.
+    """Place of one loop in the design: stage, label of the matrix variant, and numbers.
 
-    Parameters
-    ----------
-    stage
-        One of :data:`STAGES`.
-    variant
-        Label of the matrix variant.
-    index
-        Number of the turbulence realisation, common to all variants and candidates.
-    candidate
-        Number of the parameter set, in the later stages.
+    ``index`` is the turbulence realisation, common to all variants and candidates; ``candidate`` the
+    parameter set, in the later stages.
     """
 
     stage: str
@@ -78,14 +70,8 @@ class Slot:
 class Design:
     """Number of loops in each stage.
 
-    Parameters
-    ----------
-    trials
-        Loops of the first stage over all variants.
-    candidates, replicates
-        Parameter sets of each variant in the second stage, and the realisations each one runs on.
-    final_replicates
-        Realisations that the best parameter set of each variant runs on.
+    ``trials`` loops of the first stage, over all variants; ``candidates`` parameter sets of each variant in
+    the second stage, each on ``replicates`` realisations; ``final_replicates`` realisations for the best one.
     """
 
     trials: int = 200
@@ -120,22 +106,10 @@ class Design:
 class Sweep:
     """What is swept.
 
-    Parameters
-    ----------
-    config
-        The whole configuration, as TOML.
-    variants, space, design
-        What is compared, what is varied, and the number of loops.
-    frames
-        Length of a loop.
-    seed
-        Of the draws and of the turbulence.
-    metric
-        Strehl ratio that is maximised; one of :data:`METRICS`.
-    psf
-        File of the model PSF, or ``None`` when each trial computes its own.
-    simulated
-        Whether each trial opens a simulated bench with its own turbulence.
+    ``config`` is the whole configuration as TOML, ``frames`` the length of a loop, ``seed`` that of the draws
+    and of the turbulence, ``metric`` the Strehl ratio that is maximised, ``psf`` the file of the model PSF
+    (``None``: each trial computes its own). If ``simulated``, each trial opens a simulated bench with its own
+    turbulence.
     """
 
     config: str

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
 from pathlib import Path
 
 from escape_hw.api.optical_gains import GainsResult
 from escape_hw.api.procedure import Procedure
-from escape_hw.api.results import CalibrationResult
 from escape_hw.bench import Bench
 from escape_hw.errors import ConfigError
 from escape_hw.io.fits.matrix import MatrixProduct, save_matrix
@@ -20,9 +18,10 @@ from escape_hw.runtime.procedures.calibration_comparison import (
     CalibrationComparison,
     measure_matrices,
     measure_optical_gains,
+    scale_by_gains,
     with_and_without_optical_gains,
 )
-from escape_hw.runtime.procedures.products import add_calibration, add_gains, product_key
+from escape_hw.runtime.procedures.products import add_result, product_key
 from escape_hw.runtime.session.record import BenchRecord
 from escape_hw.runtime.sweep.design import MatrixVariant
 
@@ -30,15 +29,8 @@ from escape_hw.runtime.sweep.design import MatrixVariant
 def measure_variants(bench: Bench, *, frames: int, gain_frames: int = 0) -> Procedure[CalibrationComparison]:
     """Measure the push-pull, DO-CRIME and ESCAPE matrices, and their optical gains.
 
-    Parameters
-    ----------
-    bench
-        An open bench.
-    frames
-        Frames of the DO-CRIME measurement.
-    gain_frames
-        Frames per round of the optical gains at most. 0: none are measured, as for a Shack-Hartmann
-        sensor, whose optical gains are close to one.
+    ``gain_frames`` are frames per round of the optical gains at most. 0: none are measured, as for a
+    Shack-Hartmann sensor, whose optical gains are close to one.
 
     Raises
     ------
@@ -68,26 +60,19 @@ def save_variants(
     saved: dict[str, Path] = {}
     for label, calibration in calibrations.items():
         parent = saved.get(label.removesuffix(WITH_GAINS))
-        source = {} if parent is None else {"im": parent}
-        saved[label] = add_calibration(folder, record, product_key(label), calibration, source)
+        source = [] if parent is None else [parent]
+        saved[label] = add_result(folder, record, product_key(label), calibration, *source)
     if measured.gains is not None:
-        add_gains(folder, record, "gains", measured.gains, {"im": saved["ESCAPE"]})
+        add_result(folder, record, "gains", measured.gains, saved["ESCAPE"])
     return [_make_variant(label, path) for label, path in saved.items()]
 
 
 def read_variants(
     products: Sequence[MatrixProduct], gains: GainsResult | None, folder: Path
 ) -> list[MatrixVariant]:
-    """Variants from files.
+    """Variants from files; several matrices of the same kind are named by their files.
 
-    Parameters
-    ----------
-    products
-        The matrices. Several of the same kind are named by their files.
-    gains
-        Optical gains from ``escape gains``: every matrix that has some is also compared scaled by them.
-    folder
-        Folder for the scaled matrices.
+    Every matrix that has optical gains is also compared scaled by them, and then saved in the folder.
 
     Raises
     ------
@@ -101,8 +86,11 @@ def read_variants(
     }
     if len(named) < len(products):
         raise ConfigError("two of the matrices have files of the same name; rename one")
-    scaled = {} if gains is None else _scale_by_gains({k: one.result for k, one in named.items()}, gains)
-    if gains is not None and not scaled:
+    vectors = {}
+    if gains is not None:
+        known = {METHOD_LABELS.get(gains.method, gains.method): gains.gains, **gains.comparisons}
+        vectors = {label: known.get(label) or known.get(product_key(label)) for label in named}
+    if gains is not None and not any(vectors.values()):
         raise ConfigError(
             f"the optical gains are those of {', '.join((gains.method, *gains.comparisons))}; "
             f"the matrices are {', '.join(named)}"
@@ -110,26 +98,12 @@ def read_variants(
     variants = []
     for label, product in named.items():
         variants.append(MatrixVariant(label, False, product.path.absolute(), product.sha256))
-        if label in scaled:
-            path = save_matrix(folder / f"{product_key(label + WITH_GAINS)}.fits", scaled[label])
+        vector = vectors.get(label)
+        if vector is not None:
+            scaled = scale_by_gains(product.result, vector)
+            path = save_matrix(folder / f"{product_key(label + WITH_GAINS)}.fits", scaled)
             variants.append(_make_variant(label + WITH_GAINS, path))
     return variants
-
-
-def _scale_by_gains(
-    known: Mapping[str, CalibrationResult], gains: GainsResult
-) -> dict[str, CalibrationResult]:
-    from escape_hw.calibration.optical_gain.matrix_comparison import scale_matrix
-    from escape_hw.calibration.optical_gain.smoothing import clip_gains
-
-    vectors = {METHOD_LABELS.get(gains.method, gains.method): gains.gains, **gains.comparisons}
-    found = {}
-    for label, one in known.items():
-        vector = vectors.get(label) or vectors.get(product_key(label))
-        if vector is not None:
-            matrix = scale_matrix(one.matrix, clip_gains(vector), vector.best_sigma)
-            found[label] = replace(one, matrix=matrix, measured=None)
-    return found
 
 
 def _make_variant(label: str, path: Path) -> MatrixVariant:

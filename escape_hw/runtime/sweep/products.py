@@ -13,7 +13,7 @@ from escape_hw.io.documents import strehl_document
 from escape_hw.io.run_folder import RunFolder, read_result
 from escape_hw.report.run_report import REPORT, write_report
 from escape_hw.runtime.procedures.criteria import criterion
-from escape_hw.runtime.procedures.products import write_run_result
+from escape_hw.runtime.procedures.products import save_run
 from escape_hw.runtime.session.record import BenchRecord
 from escape_hw.runtime.sweep.description import SweepDescription
 from escape_hw.runtime.sweep.design import EXPLORE, METRICS, STAGES
@@ -120,14 +120,9 @@ def save_sweep(
     result: SweepResult,
     wall_seconds: float,
 ) -> dict[str, Any]:
-    """Save the description, the table of all loops, ``result.json`` and the report of a sweep.
+    """Save description, table of loops, ``result.json`` and report of a sweep; returns the document.
 
     The sweep can also be resumed from this folder: its description names the same study.
-
-    Returns
-    -------
-    dict
-        The run's document; its ``criteria`` say which were met.
 
     Raises
     ------
@@ -136,35 +131,18 @@ def save_sweep(
     """
     description.save(folder.path)
     folder.add_product("trials", folder.write_text(TRIALS, trials_csv(result)))
-    document = {
-        **record.header_fields("sweep"),
-        "title": f"Matrices compared, each at its best: {record.system}",
-        **sweep_document(result),
-        "storage": redact_password(description.storage),
-        "study": description.study,
-        "sampler": description.sampler,
-        **record.footer_fields(wall_seconds),
-    }
-    return write_run_result(folder, document)
+    return save_run(
+        folder, record, "sweep", f"Matrices compared, each at its best: {record.system}", wall_seconds,
+        **sweep_document(result), storage=redact_password(description.storage), study=description.study,
+        sampler=description.sampler,
+    )  # fmt: skip
 
 
 def find_finished_result(run: Path, description: SweepDescription) -> dict[str, Any] | None:
-    """The result of a finished sweep, from its own folder or from the one it was resumed in.
+    """The result of a finished sweep with its folder, which may be the one it was resumed in.
 
-    A missing report is built again.
-
-    Parameters
-    ----------
-    run
-        Folder of the sweep to resume.
-    description
-        Its description.
-
-    Returns
-    -------
-    dict or None
-        Its ``result.json`` with the folder; ``None`` when loops are left to run, or the folder of the
-        result was removed.
+    ``None`` when loops are left to run, or the folder of the result was removed. A missing report is built
+    again.
 
     Raises
     ------

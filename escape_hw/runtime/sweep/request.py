@@ -45,12 +45,7 @@ def require_optuna() -> None:
 def parse_search_space(config: SystemConfig, texts: Sequence[str]) -> tuple[Parameter, ...]:
     """The search space; on hardware, only the loop's parameters within given limits.
 
-    Parameters
-    ----------
-    config
-        Of the system.
-    texts
-        See :func:`~escape_hw.runtime.sweep.search_space.parse_parameter`.
+    For the texts see :func:`~escape_hw.runtime.sweep.search_space.parse_parameter`.
 
     Raises
     ------
@@ -120,8 +115,7 @@ def run_matrix_sweep(
     require_loop_frames(bench.config, request["frames"])
     from escape_hw.runtime.sweep.description import DESCRIPTION_FILE, describe_sweep, read_description
     from escape_hw.runtime.sweep.design import Design
-    from escape_hw.runtime.sweep.result import analyse_sweep
-    from escape_hw.runtime.sweep.run import run_sweep
+    from escape_hw.runtime.sweep.result import sweep_and_analyse
     from escape_hw.runtime.sweep.workers import open_workers
 
     folder = folder.absolute()
@@ -132,15 +126,9 @@ def run_matrix_sweep(
         known = read_description(folder)
         description = known if known.settings() == description.settings() else description
     description.save(folder)
-    simulated = description.sweep.simulated
-    pool = open_workers(workers, scheduler) if simulated else None
-    try:
-        procedure = run_sweep(description.open_study(), pool or bench)
-        found = run(procedure, progress=progress)
-    finally:
-        if pool is not None:
-            pool.close()
-    return analyse_sweep(description.sweep, found, description.margin)
+    runner = open_workers(workers, scheduler) if description.sweep.simulated else bench
+    result: SweepResult = run(sweep_and_analyse(description, runner), progress=progress)
+    return result
 
 
 def _save_matrices(matrices: Mapping[str, CalibrationLike], folder: Path) -> list[MatrixVariant]:

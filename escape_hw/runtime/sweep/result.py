@@ -13,11 +13,15 @@ from optuna.distributions import CategoricalDistribution, FloatDistribution
 from optuna.importance import FanovaImportanceEvaluator, get_param_importances
 from optuna.trial import create_trial
 
+from escape_hw.api.procedure import Procedure
 from escape_hw.api.results import Estimate, StrehlEstimate
+from escape_hw.bench import Bench
 from escape_hw.pipeline.statistics import MIN_PAIRS, PairedComparison, compare_pairs, describe_comparison
+from escape_hw.runtime.sweep.description import SweepDescription
 from escape_hw.runtime.sweep.design import EXPLORE, FINAL, METRICS, MatrixVariant, Sweep
-from escape_hw.runtime.sweep.run import SweepRun
+from escape_hw.runtime.sweep.run import SweepRun, run_sweep
 from escape_hw.runtime.sweep.study import TrialRecord
+from escape_hw.runtime.sweep.workers import Workers
 
 #: Importance of a dummy parameter without effect: the share that noise gives to any parameter.
 CHANCE = "chance"
@@ -32,14 +36,8 @@ DEFAULT_MARGIN = 0.01
 class BestLoops:
     """A variant at its own best parameters.
 
-    Parameters
-    ----------
-    values
-        The parameters.
-    strehl
-        Mean over the realisations of the last stage, with its standard error over them.
-    closed, loops
-        Loops that stayed closed, and all.
+    ``strehl`` is the mean over the realisations of the last stage, with its standard error over them; of the
+    ``loops``, ``closed`` stayed closed.
     """
 
     values: dict[str, Any]
@@ -102,12 +100,7 @@ class SweepResult:
 def analyse_sweep(sweep: Sweep, run: SweepRun, margin: float = DEFAULT_MARGIN) -> SweepResult:
     """Best parameters, comparisons and importances from the loops of a sweep.
 
-    Parameters
-    ----------
-    sweep, run
-        The sweep and its loops.
-    margin
-        Largest difference in the Strehl ratio that counts as equivalent.
+    ``margin`` is the largest difference in the Strehl ratio that counts as equivalent.
     """
     best = {}
     for variant in sweep.variants:
@@ -125,6 +118,16 @@ def analyse_sweep(sweep: Sweep, run: SweepRun, margin: float = DEFAULT_MARGIN) -
         tuple(_comparisons(sweep, at_random, margin)),
         importances(sweep, run.records), importances(sweep, run.records, closed_only=True),
     )  # fmt: skip
+
+
+def sweep_and_analyse(description: SweepDescription, runner: Workers | Bench) -> Procedure[SweepResult]:
+    """Run a sweep, see :func:`~escape_hw.runtime.sweep.run.run_sweep`, close its workers, and analyse it."""
+    try:
+        run = yield from run_sweep(description.open_study(), runner)
+    finally:
+        if isinstance(runner, Workers):
+            runner.close()
+    return analyse_sweep(description.sweep, run, description.margin)
 
 
 def _summarise_final(final: Sequence[TrialRecord]) -> BestLoops:
@@ -168,14 +171,8 @@ def importances(
 ) -> dict[str, float]:
     """Share of each parameter in the variance of the Strehl ratio (fANOVA, Hutter et al. 2014, by Optuna).
 
-    The matrix counts as a parameter (paper, validation procedure).
-
-    Parameters
-    ----------
-    sweep, records
-        The sweep and its finished loops; those of the first stage are used.
-    closed_only
-        Leave out the loops that diverged; otherwise they count with a Strehl ratio of 0.
+    The matrix counts as a parameter (paper, validation procedure). The loops of the first stage are used;
+    those that diverged count with a Strehl ratio of 0, or are left out (``closed_only``).
 
     Returns
     -------

@@ -9,7 +9,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from escape_hw.api.procedure import Procedure, Reporter
 from escape_hw.api.representation import short_repr
@@ -43,19 +42,9 @@ class SweepRun:
 
 
 def run_sweep(study: SweepStudy, runner: Workers | Bench) -> Procedure[SweepRun]:
-    """Run the unfinished loops of a sweep.
+    """Run the unfinished loops of a sweep: with workers in parallel, or on an open bench one after the other.
 
-    Parameters
-    ----------
-    study
-        Of the sweep; its finished trials do not run again.
-    runner
-        Workers that open simulated benches, or an open bench, on which the loops run one after the other.
-
-    Returns
-    -------
-    SweepRun
-        ``partial`` when the operator stopped it; loops finished by then are in the study.
+    ``partial`` of the result is true when the operator stopped it; loops finished by then are in the study.
 
     Raises
     ------
@@ -127,7 +116,7 @@ def _run_in_parallel(
             for future in completed:
                 # An error ends the sweep: the same trial would raise it again.
                 future.result()
-            if report.due():
+            if report.is_due():
                 yield report(n_before + len(plan) - n_unfinished)
     except BaseException:
         study.stop()
@@ -191,28 +180,17 @@ def _candidates(sweep: Sweep, records: Sequence[TrialRecord]) -> dict[tuple[str,
 def shortlist(
     records: Sequence[TrialRecord], space: Sequence[Parameter], variant: str, count: int
 ) -> list[dict[str, Any]]:
-    """The parameters of the most promising loops of a variant's first stage, best first.
+    """Parameters of the ``count`` most promising loops of a variant's first stage, best first.
 
-    Loops are ranked by the mean merit of their nearest neighbours among the parameters, themselves
-    included: the Strehl ratio of a single loop also depends on its turbulence. Loops that diverged count
-    with 0.
-
-    Parameters
-    ----------
-    records
-        Finished loops.
-    space
-        What was varied.
-    variant
-        Label of the matrix variant.
-    count
-        How many; fewer where fewer loops stayed closed.
+    Fewer where fewer loops stayed closed. Loops are ranked by the mean merit of their nearest neighbours
+    among the parameters, themselves included: the Strehl ratio of a single loop also depends on its
+    turbulence. Loops that diverged count with 0.
     """
     own = [r for r in records if r.slot.stage == EXPLORE and r.slot.variant == variant]
     closed = [number for number, record in enumerate(own) if record.merit > 0]
     if not closed:
         return []
-    points = np.stack([_unit_point(record.values, space) for record in own])
+    points = np.array([[unit_coordinate(one, record.values[one.key]) for one in space] for record in own])
     merits = np.array([record.merit for record in own])
     n_neighbours = max(1, min(_MAX_NEIGHBOURS, round(_MAX_NEIGHBOUR_FRACTION * len(own))))
 
@@ -221,10 +199,6 @@ def shortlist(
         return float(merits[np.argsort(distance, kind="stable")[:n_neighbours]].mean())
 
     return [own[n].values for n in sorted(closed, key=neighbour_mean, reverse=True)[:count]]
-
-
-def _unit_point(values: dict[str, Any], space: Sequence[Parameter]) -> NDArray[np.float64]:
-    return np.array([unit_coordinate(one, values[one.key]) for one in space])
 
 
 def unit_coordinate(one: Parameter, value: Any) -> float:

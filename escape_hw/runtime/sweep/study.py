@@ -89,22 +89,17 @@ class SweepStudy:
     Several runners on several machines may share one. Optuna hands each enqueued trial to one of them,
     records heartbeats while :meth:`run_next` runs it, and fails it when they stop, after which it is
     enqueued again with a new number: loops are identified by the slot in their user attributes. Every call
-    waits up to ``timeout_s`` for a storage that does not answer.
+    waits up to ``timeout_s`` for a storage that does not answer. Loops have heartbeats in simulation; on
+    hardware one runner uses :meth:`ask` and :meth:`tell`.
 
     Parameters
     ----------
-    sweep
-        Its loops have heartbeats in simulation. On hardware one runner uses :meth:`ask` and :meth:`tell`.
     url
         SQLAlchemy's URL: ``sqlite:////path/study.db``, ``postgresql+psycopg://user@host/name``.
-    name
-        Name of the study.
     settings
         Settings that must agree to resume a study.
     use_tpe
         TPE instead of random parameters.
-    timeout_s
-        Seconds to wait for a storage that does not answer.
 
     Raises
     ------
@@ -145,15 +140,8 @@ class SweepStudy:
         """Enqueue the next loops of a stage; trials of runners that died count as missing.
 
         Loops of the first stage get random parameters, or those that TPE chooses from the finished ones.
-
-        Parameters
-        ----------
-        plan
-            Every slot of the stage.
-        values
-            Parameters by variant and candidate, in the later stages.
-        n_free
-            Length of the queue that the runner can start at once.
+        Later stages have them in ``values``, by variant and candidate. At most ``n_free`` trials wait in the
+        queue.
 
         Returns
         -------

@@ -34,21 +34,9 @@ _bench_lock = threading.Lock()
 class TrialSpec:
     """Everything that a worker needs for one loop.
 
-    Parameters
-    ----------
-    config
-        The whole configuration, as TOML.
-    matrix, sha256
-        File of the matrix and its checksum.
-    psf
-        File of the model PSF (``.npy``). ``None``: the trial computes its own, because a parameter may
-        change it.
-    values
-        The parameters by key.
-    frames
-        Length of the loop.
-    run_seed
-        Seed of turbulence and noise in simulation; ``None`` on hardware.
+    ``config`` is the whole configuration as TOML, ``matrix`` and ``sha256`` file and checksum of the matrix,
+    ``psf`` the file of the model PSF (``.npy``; ``None``: the trial computes its own, because a parameter may
+    change it), ``run_seed`` the seed of turbulence and noise in simulation (``None`` on hardware).
     """
 
     config: str
@@ -86,13 +74,9 @@ class TrialSpec:
 
 
 def run_trial(spec: TrialSpec) -> dict[str, Any]:
-    """Open the simulated bench and close the loop.
+    """Open the simulated bench and close the loop; see :func:`loop_outcome`.
 
-    Returns
-    -------
-    dict
-        See :func:`loop_outcome`. A loop that cannot be closed (singular matrix, no light) counts as
-        diverged; ``notes`` hold the reason.
+    A loop that cannot be closed (singular matrix, no light) counts as diverged; ``notes`` hold the reason.
     """
     disable_helper_threads()
     with _bench_lock, Bench.from_config(spec.build_config()) as bench:

@@ -105,13 +105,7 @@ class Workers(ABC):
 
 
 class LocalWorkers(Workers):
-    """Processes on this computer.
-
-    Parameters
-    ----------
-    count
-        Number of processes.
-    """
+    """Processes on this computer."""
 
     _lost_errors = (CancelledError, BrokenProcessPool)
     _executor: Any
@@ -139,21 +133,14 @@ class LocalWorkers(Workers):
 
 
 class DaskWorkers(Workers):
-    """Workers of a Dask scheduler, on any number of machines that see the matrices' files.
-
-    Parameters
-    ----------
-    address
-        Such as ``tcp://host:8786``.
-    timeout_s
-        Seconds to wait for a scheduler that does not answer.
+    """Workers of a Dask scheduler (``tcp://host:8786``), on machines that see the matrices' files.
 
     Raises
     ------
     ConfigError
         Dask is not installed.
     CalibrationError
-        No scheduler answers.
+        No scheduler answers within ``timeout_s`` seconds.
     """
 
     def __init__(self, address: str, timeout_s: float = SCHEDULER_TIMEOUT_S) -> None:

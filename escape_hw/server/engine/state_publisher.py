@@ -16,7 +16,6 @@ import numpy as np
 
 from escape_hw.api.camera import Frame
 from escape_hw.api.device import Device
-from escape_hw.api.outlines import outlines
 from escape_hw.api.sensor import SensorGeometry
 from escape_hw.bench import Bench
 from escape_hw.io.provenance import format_utc, get_software_version
@@ -222,6 +221,6 @@ def geometry_of(bench: Bench, grid: SensorGeometry | None) -> Geometry:
         valid=valid,
         layout=actuator_layout(bench),
         positions_m=actuator_positions(bench),
-        outlines_px=() if grid is None else outlines(grid),
+        outlines_px=() if grid is None else grid.outlines(),
         n_modes=bench.config.basis.n_modes,
     )

@@ -24,17 +24,9 @@ _NICE = 5
 
 
 class RecorderProcess:
-    """Records streams in another process.
+    """A :class:`~escape_hw.streams.recording.recorder.StreamRecorder` in another process.
 
-    Parameters
-    ----------
-    folder, streams, min_free_bytes
-        As for :class:`~escape_hw.streams.recording.recorder.StreamRecorder`.
-
-    Raises
-    ------
-    StorageError
-        The process cannot be started.
+    Raises ``StorageError`` if the process cannot be started.
     """
 
     def __init__(

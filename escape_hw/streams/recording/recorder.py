@@ -102,7 +102,7 @@ class StreamRecorder:
 
     Raises
     ------
-    StreamGone
+    StreamUnavailable
         A segment does not exist.
     OSError
         The folder cannot be written to.

@@ -13,16 +13,14 @@ from __future__ import annotations
 import contextlib
 import enum
 import logging
-import os
 import shutil
 import socket
+import socketserver
 import struct
 import tempfile
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, Self
 
 import numpy as np
@@ -30,6 +28,7 @@ import numpy as np
 from escape_hw.api.camera import Camera, CameraSettings, Region
 from escape_hw.api.emulator import EmulatorRequest
 from escape_hw.errors import EscapeError, FrameTimeout
+from escape_hw.supervision import BackgroundThread
 from escape_sim.devices.twins import make_mirror, make_science_camera, make_wfs_camera, shared_bench
 from escape_sim.emulators.e727.emulator import E727Emulator
 from escape_sim.stand_ins.library import build_library
@@ -42,6 +41,8 @@ log = logging.getLogger(__name__)
 _REQUEST_HEAD, _REPLY_HEAD = struct.Struct("=II"), struct.Struct("=ii")
 _START, _FRAME, _FRAME_HEAD = struct.Struct("=4I3d"), struct.Struct("=d"), struct.Struct("=qq")
 _OK, _TIMEOUT, _REFUSED = 0, 1, 2
+#: Period in seconds at which the server checks whether it should stop.
+_STOP_POLL_S = 0.05
 #: Limit for requests, larger than any shape.
 _MAX_REQUEST_BYTES = 1 << 20
 #: Time-out in seconds of a poll for a frame, too short to advance the simulated time noticeably.
@@ -96,11 +97,10 @@ class StandInBenchServer:
         self.requests = dict.fromkeys(RequestKind, 0)
         # The bench has one clock; requests of its devices are processed one at a time.
         self._twin_lock = threading.Lock()
-        self._listener: socket.socket | None = None
+        self._server: socketserver.ThreadingUnixStreamServer | None = None
         self._folder: Path | None = None
         self.modulator: E727Emulator | None = None
         self._connections: set[socket.socket] = set()
-        self._threads: list[threading.Thread] = []
 
     def start(self) -> str:
         """Build the bench and listen; returns the socket's path.
@@ -114,13 +114,12 @@ class StandInBenchServer:
         shared_bench(self.config, self.shared)
         self._folder = Path(tempfile.mkdtemp(prefix="escape-"))
         path = str(self._folder / "bench")
-        self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-        self._listener.bind(path)
-        self._listener.listen()
+        self._server = server = socketserver.ThreadingUnixStreamServer(
+            path,
+            lambda connection, *_: self._serve(connection),  # type: ignore[arg-type]  # called like a class
+        )
         self.environment = {**libraries, _SOCKET_VARIABLE: path, **self._start_modulator_emulator()}
-        thread = threading.Thread(target=self._accept, name="bench", daemon=True)
-        thread.start()
-        self._threads.append(thread)
+        BackgroundThread("bench", lambda: server.serve_forever(_STOP_POLL_S)).start()
         return path
 
     def _start_modulator_emulator(self) -> dict[str, str]:
@@ -138,15 +137,13 @@ class StandInBenchServer:
         if self.modulator is not None:
             self.modulator.stop()
             self.modulator = None
-        listener, self._listener = self._listener, None
-        if listener is not None:
-            for endpoint in (listener, *self._connections):
+        server, self._server = self._server, None
+        if server is not None:
+            server.shutdown()
+            for connection in list(self._connections):
                 with contextlib.suppress(OSError):
-                    endpoint.shutdown(socket.SHUT_RDWR)
-            listener.close()
-        for thread in self._threads:
-            thread.join(timeout=10)
-        self._threads.clear()
+                    connection.shutdown(socket.SHUT_RDWR)
+            server.server_close()
         folder, self._folder = self._folder, None
         if folder is not None:
             shutil.rmtree(folder)
@@ -155,27 +152,13 @@ class StandInBenchServer:
         self.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *exception: object) -> None:
         self.stop()
-
-    def _accept(self) -> None:
-        listener = self._listener
-        while listener is not None:
-            try:
-                connection, _ = listener.accept()
-            except OSError:
-                # The socket was shut down by stop(), the only way to end accept().
-                return
-            self._connections.add(connection)
-            thread = threading.Thread(target=self._serve, args=(connection,), daemon=True)
-            thread.start()
-            self._threads.append(thread)
 
     def _serve(self, connection: socket.socket) -> None:
         """Process the requests of one stand-in until it disconnects."""
         handle_request: Callable[[RequestKind, bytes], Reply] = self._refuse_before_hello
+        self._connections.add(connection)
         with connection:
             try:
                 while (request := _receive(connection)) is not None:
@@ -278,18 +261,3 @@ def _receive_exactly(connection: socket.socket, length: int) -> bytes | None:
             return None
         parts += part
     return bytes(parts)
-
-
-@contextmanager
-def stand_in_environment(server: StandInBenchServer) -> Iterator[None]:
-    """Set the environment variables of a bench in this process."""
-    before = {key: os.environ.get(key) for key in server.environment}
-    os.environ.update(server.environment)
-    try:
-        yield
-    finally:
-        for key, value in before.items():
-            if value is None:
-                del os.environ[key]
-            else:
-                os.environ[key] = value

@@ -100,17 +100,8 @@ def _compile(compiler: str, name: str, sources: dict[str, bytes], target: Path) 
 class StandIn:
     """A stand-in loaded in this process; its state is global to the process.
 
-    Attributes
-    ----------
-    path
-        The shared library, to be given to a driver.
-    library
-        The library as loaded by ctypes.
-
-    Raises
-    ------
-    StandInUnavailable
-        It cannot be compiled on this machine.
+    ``path`` is the shared library, to be given to a driver; ``library`` is it as loaded by ctypes. Raises
+    :class:`StandInUnavailable` if it cannot be compiled on this machine.
     """
 
     def __init__(self, name: str) -> None:
@@ -128,13 +119,7 @@ class StandIn:
         return self
 
     def script(self, text: str) -> Self:
-        """Add rules of faults, one per line or separated by semicolons; syntax in ``stand_in.h``.
-
-        Raises
-        ------
-        ValueError
-            A rule is invalid.
-        """
+        """Add rules of faults, one per line or separated by semicolons; syntax in ``stand_in.h``."""
         line = self.library.escape_stand_in_script(text.encode())
         if line:
             wrong = text.replace(";", "\n").split("\n")[line - 1].strip()

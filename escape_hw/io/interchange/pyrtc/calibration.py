@@ -387,7 +387,7 @@ def export_matrix(
         "slope_unit": matrix.slope_unit,
         "frames": result.frames,
         "lost_frames": result.lost_frames,
-        "delay_frames": None if result.response is None else result.response.delay,
+        "delay_frames": None if result.response is None else result.response.delay_frames,
         **registration_document(result.registration),
     }
     write_file(paths["im"], data, MATRIX, record, {"sigma": sigma})

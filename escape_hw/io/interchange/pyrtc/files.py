@@ -178,7 +178,7 @@ class LegacyConvention:
 
     def __post_init__(self) -> None:
         if self.frame_order not in FRAME_ORDERS:
-            raise ConfigError(f"--legacy {self.frame_order}: it is one of {', '.join(FRAME_ORDERS)}")
+            raise ConfigError(f"--frame-order {self.frame_order}: it is one of {', '.join(FRAME_ORDERS)}")
 
     def map(self, slope_map: NDArray[Any]) -> NDArray[Any]:
         """A slope map or mask as 2.x has it: ``(2 N, N)``, x above y; a pyramid's ``(2 R, 4 R)``."""
@@ -213,7 +213,7 @@ def require_frame_order(file: PyrtcFile, frame_order: str | None) -> None:
     if frame_order is None:
         raise IncompatibleProduct(
             f"{file.path}: a file of pyRTC 1.x without the orientation of its frames; give it with "
-            "--legacy yx (frames as the camera gave them), xy (transposed by pyRTC's camera adapter) or "
+            "--frame-order yx (frames as the camera gave them), xy (transposed by pyRTC's camera adapter) or "
             "as_is (already as 2.x has it)"
         )
 

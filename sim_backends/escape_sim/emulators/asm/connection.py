@@ -7,11 +7,14 @@ import socket
 import struct
 import time
 from dataclasses import dataclass
-from typing import Protocol, cast
+from typing import TYPE_CHECKING, cast
 
 from escape_hw.errors import ConfigError
 from escape_sim.emulators.asm import protocol
-from escape_sim.emulators.faults import current_word, split_fault_script
+from escape_sim.emulators.options import current_word
+
+if TYPE_CHECKING:
+    from escape_sim.emulators.asm.server import AsmServer
 
 #: Kinds of fault, and whether they take a value.
 FAULT_KINDS = {
@@ -38,13 +41,7 @@ class AsmFault:
 
     @classmethod
     def from_text(cls, text: str) -> AsmFault:
-        """Parse a fault such as ``contaminate:17`` or ``reset``.
-
-        Raises
-        ------
-        ConfigError
-            The kind is unknown, or its value is missing or not a number.
-        """
+        """Parse a fault such as ``contaminate:17`` or ``reset``; raises ``ConfigError`` if it is none."""
         kind, colon, value = text.strip().partition(":")
         kind = current_word(kind, _RENAMED_FAULTS)
         if kind not in FAULT_KINDS or bool(colon) != FAULT_KINDS[kind]:
@@ -56,43 +53,8 @@ class AsmFault:
             raise ConfigError(f"fault {text!r}: {value!r} is not a number") from error
 
 
-def parse_fault_script(script: str) -> dict[int, AsmFault]:
-    """Faults of a script such as ``skip@3,contaminate:17@40``, by the number of the owner's request.
-
-    Raises
-    ------
-    ConfigError
-        The script has another form.
-    """
-    return {number: AsmFault.from_text(text) for text, number in split_fault_script(script)}
-
-
-class ClientRequests(Protocol):
-    """Receives the requests and events of all connections."""
-
-    def connection_made(self, connection: AsmConnection) -> None:
-        """A client has connected."""
-
-    def connection_lost(self, connection: AsmConnection) -> None:
-        """A connection has ended."""
-
-    def next_fault(self, connection: AsmConnection) -> AsmFault | None:
-        """Fault of the link for the next request of a connection."""
-
-    def handle(
-        self, connection: AsmConnection, request: protocol.AsmRequest, superseded: bool, received_ns: int
-    ) -> tuple[int, bytes]:
-        """Process a request; returns type and payload of the reply."""
-
-    def report_damaged_frame(self, connection: AsmConnection, damage: str) -> None:
-        """Bytes were received that are not a frame."""
-
-    def report_violation(self, message: str) -> None:
-        """Record a violation of the protocol by a client."""
-
-
 class AsmConnection(asyncio.Protocol):
-    """Decodes requests, sends the replies of a handler, and applies scripted faults of the link.
+    """Decodes requests, sends the replies of the server, and applies scripted faults of the link.
 
     Attributes
     ----------
@@ -106,7 +68,7 @@ class AsmConnection(asyncio.Protocol):
         Time of the last valid frame, monotonic seconds.
     """
 
-    def __init__(self, handler: ClientRequests) -> None:
+    def __init__(self, handler: AsmServer) -> None:
         self._handler = handler
         self._transport: asyncio.Transport | None = None
         self._received = bytearray()

@@ -37,10 +37,6 @@ class AsmController:
 
     Parameters
     ----------
-    shell
-        The shell.
-    limits
-        Limits of the mirror itself.
     contaminated
         Actuators that the mirror has taken out of service.
     speed
@@ -84,11 +80,6 @@ class AsmController:
     def out_of_service(self) -> set[int]:
         """Contaminated or disabled actuators."""
         return self.contaminated | self.disabled
-
-    @property
-    def is_changing_state(self) -> bool:
-        """Whether a state transition is in progress."""
-        return self._transition is not None
 
     def request_state(self, wanted: ShellState, now: float) -> tuple[int, str]:
         """Start a state transition; returns result code and message."""

@@ -4,22 +4,20 @@ from __future__ import annotations
 
 import asyncio
 import threading
-from typing import TYPE_CHECKING, Any
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
+from pydantic import Field
 
 from escape_hw.api.emulator import Emulator, EmulatorRequest
 from escape_hw.config.loader import load_system
 from escape_hw.errors import ConfigError
 from escape_sim.devices.twins import shared_bench
-from escape_sim.emulators.asm.connection import AsmFault, parse_fault_script
+from escape_sim.emulators.asm.connection import AsmFault
 from escape_sim.emulators.asm.controller import AsmController, AsmLimits
 from escape_sim.emulators.asm.server import AsmServer
-from escape_sim.emulators.faults import current_word
+from escape_sim.emulators.options import EmulatorOptions, parse_fault_script
 from escape_sim.mirror.shell import MovingActuators, RealTimeActuators, Shell
-
-if TYPE_CHECKING:
-    pass
 
 #: Default port, as of the driver.
 PORT = 7336
@@ -27,48 +25,47 @@ PORT = 7336
 HOLD_S, REST_S = 0.3, 1.0
 #: The same on a simulated bench, whose computation may take longer than the simulated time.
 TWIN_HOLD_S, TWIN_REST_S = 5.0, 20.0
-_OPTIONS = ("system", "contaminated", "fault", "transition_speed", "hold_s", "rest_s", "versions")
-_RENAMED_OPTIONS = {
-    "dust": "contaminated", "speed": "transition_speed", "hold": "hold_s", "rest": "rest_s",
-}  # fmt: skip
+Positive = Annotated[float, Field(gt=0, le=1e6)]
 
 
 def make_emulator(request: EmulatorRequest) -> AsmEmulator:
-    """Entry point ``asm`` of ``escape.emulators``.
-
-    Raises
-    ------
-    ConfigError
-        An option is unknown or has no valid value.
-    """
+    """Entry point ``asm``; raises ``ConfigError`` if an option is unknown or has no valid value."""
     if request.pty:
         raise ConfigError("--pty: an adaptive secondary is on the network; omit it")
     return AsmEmulator(request)
 
 
-def _current_options(request: EmulatorRequest) -> dict[str, str]:
-    options = {current_word(key, _RENAMED_OPTIONS): value for key, value in request.options.items()}
-    unknown = [key for key in options if key not in _OPTIONS]
-    if unknown:
-        raise ConfigError(f"--option {unknown[0]}: unknown; the emulator 'asm' has {', '.join(_OPTIONS)}")
-    return options
+class AsmOptions(EmulatorOptions):
+    """Options of :class:`AsmEmulator`."""
+
+    RENAMED: ClassVar = {
+        "dust": "contaminated", "speed": "transition_speed", "hold": "hold_s", "rest": "rest_s",
+    }  # fmt: skip
+
+    system: str = "maps-nir"
+    contaminated: str = ""
+    fault: str = ""
+    transition_speed: Positive = 1.0
+    hold_s: Positive | None = None
+    rest_s: Positive | None = None
+    versions: str = Field("1,1", pattern=r"^\d+,\d+$")
 
 
 class AsmEmulator(Emulator):
     """The adaptive secondary of a system behind a TCP port, in its own thread.
 
     Options: ``system`` (default ``maps-nir``), ``contaminated`` (further contaminated actuators,
-    ``17,18``), ``fault`` (see :func:`~escape_sim.emulators.asm.connection.parse_fault_script`),
+    ``17,18``), ``fault`` (kinds: :data:`~escape_sim.emulators.asm.connection.FAULT_KINDS`),
     ``transition_speed`` (factor on the speed of state transitions), ``hold_s`` and ``rest_s`` (watchdog,
     seconds), ``versions`` (lowest and highest supported, ``1,1``).
     """
 
     def __init__(self, request: EmulatorRequest) -> None:
-        options = _current_options(request)
-        config = request.config or load_system(options.get("system", "maps-nir"))
+        options = AsmOptions.from_request(request)
+        config = request.config or load_system(options.system)
         dm = config.devices.dm
         bench = shared_bench(config, request.shared) if request.shared is not None else None
-        hold, rest = (HOLD_S, REST_S) if bench is None else (TWIN_HOLD_S, TWIN_REST_S)
+        hold_s, rest_s = (HOLD_S, REST_S) if bench is None else (TWIN_HOLD_S, TWIN_REST_S)
         actuators: MovingActuators = bench or RealTimeActuators(dm.n_act, config.twin.mirror.settling_s)
         noise = np.random.default_rng(np.random.SeedSequence(config.system.seed, spawn_key=(0xA5,)))
         limits = dm.limits
@@ -77,14 +74,15 @@ class AsmEmulator(Emulator):
             Shell(actuators, dm.n_act, dm.stroke_m, noise),
             AsmLimits(
                 limits.max_stroke * dm.stroke_m, slew * dm.stroke_m,
-                _positive_option(options, "hold_s", hold), _positive_option(options, "rest_s", rest),
+                options.hold_s or hold_s, options.rest_s or rest_s,
             ),
-            {*limits.disabled, *_actuator_option(options.get("contaminated", ""), dm.n_act)},
-            speed=_positive_option(options, "transition_speed", 1.0),
+            {*limits.disabled, *_actuator_option(options.contaminated, dm.n_act)},
+            speed=options.transition_speed,
             pass_time=None if bench is None else lambda s: bench.advance_to(bench.now_s + s),
         )  # fmt: skip
-        faults, versions = parse_fault_script(options.get("fault", "")), _version_option(options)
-        self.server = AsmServer(self.controller, dm.serial, faults, versions)
+        faults = parse_fault_script(options.fault, AsmFault.from_text)
+        low, high = map(int, options.versions.split(","))
+        self.server = AsmServer(self.controller, dm.serial, faults, (low, high))
         self._host, self._port = request.host, PORT if request.port is None else request.port
         self._thread: threading.Thread | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
@@ -118,13 +116,7 @@ class AsmEmulator(Emulator):
         self._thread = self._loop = None
 
     def inject(self, text: str) -> None:
-        """Apply a fault of the mirror now, such as ``contaminate:17``.
-
-        Raises
-        ------
-        ConfigError
-            The fault is unknown.
-        """
+        """Apply a fault of the mirror now, such as ``contaminate:17``; raises ``ConfigError`` if unknown."""
         fault = AsmFault.from_text(text)
         if self._loop is not None:
             self._loop.call_soon_threadsafe(self.server.apply_mirror_fault, fault)
@@ -147,25 +139,6 @@ class AsmEmulator(Emulator):
             "requests": len(server.calls),
             "damaged_frames": server.damaged,
         }
-
-
-def _positive_option(options: dict[str, str], key: str, default: float) -> float:
-    text = options.get(key)
-    try:
-        value = default if text is None else float(text)
-    except ValueError as error:
-        raise ConfigError(f"--option {key}={text}: not a number") from error
-    if not 0 < value <= 1e6:
-        raise ConfigError(f"--option {key}={text}: must be positive")
-    return value
-
-
-def _version_option(options: dict[str, str]) -> tuple[int, int]:
-    text = options.get("versions", "1,1")
-    low, _, high = text.partition(",")
-    if not (low.isdigit() and high.isdigit()):
-        raise ConfigError(f"--option versions={text}: write LOWEST,HIGHEST")
-    return int(low), int(high)
 
 
 def _actuator_option(text: str, n_act: int) -> set[int]:

@@ -27,18 +27,7 @@ def _is_later(number: int, reference: int) -> bool:
 
 
 class AsmServer:
-    """Handles the requests of all clients.
-
-    Parameters
-    ----------
-    controller
-        The mirror.
-    serial
-        Its serial number.
-    faults
-        Faults by the number of the owner's request.
-    versions
-        Lowest and highest protocol version supported.
+    """Handles the requests of all clients; ``faults`` are by the number of the owner's request.
 
     Attributes
     ----------

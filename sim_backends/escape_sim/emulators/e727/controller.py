@@ -37,17 +37,7 @@ _CycleCache = tuple[int, list[Trajectory], tuple[float, NDArray[np.float64]] | N
 class E727Controller:
     """A controller with a tip-tilt stage on its first two channels and nothing on the third.
 
-    Parameters
-    ----------
-    settings
-        Properties of controller and stage.
-    clock
-        Monotonic seconds.
-
-    Attributes
-    ----------
-    received_commands
-        Every command in order.
+    ``clock`` gives monotonic seconds; ``received_commands`` are all commands in order.
     """
 
     def __init__(

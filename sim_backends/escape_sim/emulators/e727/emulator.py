@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from escape_hw.api.emulator import Emulator, EmulatorRequest
-from escape_hw.errors import ConfigError
 from escape_sim.emulators.e727.controller import E727Controller
 from escape_sim.emulators.e727.state import ControllerSettings
 from escape_sim.emulators.e727.transports import (
@@ -16,23 +16,26 @@ from escape_sim.emulators.e727.transports import (
     FaultInjector,
     PtyServer,
     TcpServer,
-    parse_fault_script,
+    parse_fault,
 )
+from escape_sim.emulators.options import EmulatorOptions, parse_fault_script
 
 #: Port of the real controller.
 PORT = 50000
-_OPTIONS = ("serial", "auto-zero", "zeroed", "fault")
 
 
 def make_emulator(request: EmulatorRequest) -> E727Emulator:
-    """Entry point ``e727``.
-
-    Raises
-    ------
-    ConfigError
-        An option is unknown or has no valid value.
-    """
+    """Entry point ``e727``; raises ``ConfigError`` if an option is unknown or has no valid value."""
     return E727Emulator(request)
+
+
+class E727Options(EmulatorOptions):
+    """Options of :class:`E727Emulator`."""
+
+    serial: str = ControllerSettings.serial
+    auto_zero_s: float = Field(ControllerSettings.auto_zero_s, alias="auto-zero", gt=0, le=600)
+    zeroed: Literal["0", "1"] = "0"
+    fault: str = ""
 
 
 class E727Emulator(Emulator):
@@ -43,8 +46,11 @@ class E727Emulator(Emulator):
     """
 
     def __init__(self, request: EmulatorRequest) -> None:
-        self.controller = E727Controller(_parse_options(request))
-        faults = FaultInjector(parse_fault_script(request.options.get("fault", "")))
+        options = E727Options.from_request(request)
+        self.controller = E727Controller(
+            ControllerSettings(options.serial, auto_zero_s=options.auto_zero_s, zeroed=options.zeroed == "1")
+        )
+        faults = FaultInjector(parse_fault_script(options.fault, parse_fault))
         port = PORT if request.port is None else request.port
         self.server: E727Server = (
             PtyServer(self.controller, faults)
@@ -88,21 +94,3 @@ class E727Emulator(Emulator):
         final = self.server.client_session.final_condition
         # "left" is the name of version 0.1.0.
         return {**self.controller.report(), "final_condition": final, "left": final}
-
-
-def _parse_options(request: EmulatorRequest) -> ControllerSettings:
-    options, defaults = request.options, ControllerSettings()
-    unknown = [key for key in options if key not in _OPTIONS]
-    if unknown:
-        raise ConfigError(f"e727 has no option {unknown[0]!r}; it has {', '.join(_OPTIONS)}")
-    try:
-        seconds = float(options.get("auto-zero", defaults.auto_zero_s))
-    except ValueError:
-        raise ConfigError(f"auto-zero={options['auto-zero']}: not a number of seconds") from None
-    if not 0 < seconds <= 600:
-        raise ConfigError(f"auto-zero={seconds:g}: must lie in 0..600 seconds")
-    if options.get("zeroed", "0") not in ("0", "1"):
-        raise ConfigError(f"zeroed={options['zeroed']}: write 0 or 1")
-    return ControllerSettings(
-        options.get("serial", defaults.serial), auto_zero_s=seconds, zeroed=options.get("zeroed") == "1"
-    )

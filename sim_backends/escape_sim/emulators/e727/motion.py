@@ -116,11 +116,11 @@ class MotionCommands:
 
     def set_velocity(self, args: Sequence[str]) -> None:
         """``VEL axis velocity``."""
-        for name, text in _require_unique(group_arguments(args, 2)):
+        for name, velocity in _axis_values(args):
             self._state.axis(name)
-            if not 0 < parse_number(text) <= 1e7:
+            if not 0 < velocity <= 1e7:
                 raise GcsCommandError(8)
-            self._state.axes[name].velocity = parse_number(text)
+            self._state.axes[name].velocity = velocity
 
     def halt(self, args: Sequence[str]) -> None:
         """``HLT``, ``STP`` and ``#24``: axes stop at their positions; sets error 10."""

@@ -8,13 +8,12 @@ import os
 import select
 import socket
 import threading
-import time
 import tty
 from collections.abc import Callable, Mapping
 
 from escape_hw.errors import ConfigError
 from escape_sim.emulators.e727.controller import E727Controller
-from escape_sim.emulators.faults import current_word, split_fault_script
+from escape_sim.emulators.options import current_word
 
 #: Kinds of fault: lost command; lost, late, repeated or cut reply; noise before it; closed connection,
 #: without or with a reset or a power cut of the controller; no replies any more.
@@ -28,21 +27,12 @@ _RENAMED_FAULTS = {
 _CUTS = ("close", "reset", "power_cut")
 
 
-def parse_fault_script(script: str) -> dict[int, str]:
-    """Faults of a script such as ``drop_reply@12,delay@30``, by the number of the command.
-
-    Raises
-    ------
-    ConfigError
-        The script has another form.
-    """
-    faults = {}
-    for word, number in split_fault_script(script):
-        kind = current_word(word, _RENAMED_FAULTS)
-        if kind not in FAULT_KINDS:
-            raise ConfigError(f"fault {word!r}: write KIND@NUMBER, KIND one of {', '.join(FAULT_KINDS)}")
-        faults[number] = kind
-    return faults
+def parse_fault(word: str) -> str:
+    """A kind of fault, of :data:`FAULT_KINDS`; raises ``ConfigError`` if it is none."""
+    kind = current_word(word, _RENAMED_FAULTS)
+    if kind not in FAULT_KINDS:
+        raise ConfigError(f"fault {word!r}: write KIND@NUMBER, KIND one of {', '.join(FAULT_KINDS)}")
+    return kind
 
 
 class ConnectionCut(Exception):
@@ -259,42 +249,3 @@ class PtyServer(E727Server):
             except (OSError, ConnectionCut):
                 self._close()
                 return
-
-
-class UsbPipe:
-    """Bulk endpoints of the controller, for a replacement of libusb."""
-
-    def __init__(self, controller: E727Controller, faults: FaultInjector) -> None:
-        self._controller = controller
-        self.client_session = ClientSession(controller, faults)
-        self._outgoing = bytearray()
-        self.is_plugged = True
-
-    @property
-    def serial(self) -> str:
-        """Serial number in the device's descriptor."""
-        return self._controller.settings.serial
-
-    def write(self, data: bytes) -> None:
-        """Bulk transfer to the controller; raises ConnectionError if it is unplugged."""
-        if not self.is_plugged:
-            raise ConnectionError
-        if len(data) % 2:
-            self._controller.state.report_violation(
-                f"a USB transfer of {len(data)} bytes; pad it to an even number"
-            )
-        try:
-            self._outgoing += self.client_session.feed(data)
-        except ConnectionCut:
-            self.is_plugged = False
-            raise ConnectionError from None
-
-    def read(self, size: int, timeout_s: float) -> bytes:
-        """Bulk transfer from the controller; empty after ``timeout_s``. ConnectionError if unplugged."""
-        deadline = time.monotonic() + timeout_s
-        while not self._outgoing and time.monotonic() < deadline:
-            if not self.is_plugged:
-                raise ConnectionError
-            time.sleep(min(0.002, timeout_s))
-        data, self._outgoing = bytes(self._outgoing[:size]), self._outgoing[size:]
-        return data

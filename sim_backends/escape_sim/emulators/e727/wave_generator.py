@@ -248,29 +248,13 @@ class WaveGenerators:
 
     def output(self, args: Sequence[str]) -> str:
         """``CTO?``."""
-        pairs = (
-            [(parse_integer(a), parse_integer(b)) for a, b in group_arguments(args, 2)]
-            if args
-            else sorted(self.outputs)
-        )
+        groups = group_arguments(args, 2) if args else []
+        pairs = [(parse_integer(a), parse_integer(b)) for a, b in groups] or sorted(self.outputs)
         if any(pair not in self.outputs for pair in pairs) or not pairs:
             raise GcsCommandError(17)
         return format_lines(
             [f"{line} {parameter}={self.outputs[line, parameter]:g}" for line, parameter in pairs]
         )
-
-    def pulses_s(self, output: int, name: str) -> NDArray[np.float64]:
-        """Times of rising edges within one cycle ``(n,)`` in seconds; empty without trigger."""
-        levels, wave = self.levels.get(output, {}), self._state.stage.axes[name].trajectory
-        if self.outputs.get((output, 3)) != 4 or not levels or not isinstance(wave, Wave):
-            return np.empty(0)
-        state, points = 0, []
-        for point in range(1, len(wave.table) + 1):
-            level = levels.get(point, state)
-            if level > state:
-                points.append(point - 1)
-            state = level
-        return np.array(points, float) * wave.rate * SERVO_S
 
     # ------------------------------------------------------------------ arguments
     def _require_not_running(self, name: str) -> None:

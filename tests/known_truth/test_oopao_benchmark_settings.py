@@ -1,4 +1,4 @@
-"""OOPAO stays on its leash: late, silent, unable to end the process."""
+"""OOPAO is imported late, prints nothing, and cannot end the process."""
 
 from __future__ import annotations
 

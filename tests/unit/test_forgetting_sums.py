@@ -1,4 +1,4 @@
-"""Pokes as instruments: matrices from a closed loop that least squares gets wrong."""
+"""Pokes as instruments: matrices from a closed loop, where least squares is biased."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def test_instruments_are_right_where_least_squares_is_not(truth):
     assert gain(solved(sums, 0.7 * truth)) == pytest.approx(1.0, abs=0.02)
 
 
-def test_errors_of_faded_sums_are_honest(truth):
+def test_errors_of_forgetting_sums_are_correct(truth):
     rng = np.random.default_rng(4)
     chi2 = []
     for _ in range(30):

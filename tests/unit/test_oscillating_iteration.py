@@ -1,4 +1,4 @@
-"""A descent whose steps overshoot comes to rest, and one that never does says so."""
+"""An iteration whose steps overshoot converges, and one that does not is reported."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def test_steps_that_overshoot_are_shortened_until_they_do_not(too_far):
     assert np.abs(found.alpha).max() < 0.01
 
 
-def test_a_descent_that_goes_to_and_fro_for_ever_is_given_up_with_what_is_left():
+def test_an_iteration_that_oscillates_is_ended_with_its_remaining_step():
     problem = Overshooting(30.0, at_least=0.05)
     found = descend(problem)
     assert not found.steps_converged

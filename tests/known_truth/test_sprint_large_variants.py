@@ -1,4 +1,4 @@
-"""A sensor far from its model: what the model doubts has large shares, and the gain goes with them."""
+"""A sensor far from its model: the variants have large amplitudes, correlated with the gain."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SMALL = (
     "sensor.n_sub=12", "devices.wfs.region=[220,156,200,200]", 'devices.dm.layout="circle-7"',
     "devices.dm.pitches_across_pupil=5.0", "basis.n_modes=25", "loop.dropped_modes=0",
 )  # fmt: skip
-#: Share of the doubt in the truth, in prior scatters, and the gain: as of a pyramid in weaker turbulence.
+#: Amplitude of the variant, in prior standard deviations, and gain: as of a pyramid in weaker turbulence.
 SHARE, GAIN = -7.0, 0.5
 
 
@@ -53,7 +53,7 @@ class Doubtful:
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_large_shares_are_found_with_the_registration(seed: int) -> None:
+def test_large_amplitudes_are_fitted_with_the_registration(seed: int) -> None:
     config = load_system("razor-shwfs", overrides=SMALL)
     sharp = make_fast_model(config, None)
     m2c = karhunen_loeve(*sharp.influence_functions(), 25, 4 * config.system.pupil_m)

@@ -1,4 +1,4 @@
-"""What SPRINT fits beside the registration, against injected values: there, and not there."""
+"""Extra parameters of SPRINT against injected values, zero and not zero."""
 
 from __future__ import annotations
 
@@ -125,7 +125,7 @@ def test_a_shear_stays_with_a_mirror_that_moves_on(model):
     assert np.abs(bare - with_shear).max() > 1e-2 * np.abs(with_shear).max()
 
 
-def test_shifted_pupil_images_are_told_from_a_shifted_mirror_by_their_rims():
+def test_shifted_pupil_images_are_distinguished_from_a_shifted_mirror_by_their_rims():
     config = small_pyramid()
     model = make_fast_model(config, None)
     pulls = []
@@ -142,7 +142,7 @@ def test_shifted_pupil_images_are_told_from_a_shifted_mirror_by_their_rims():
     assert np.abs(pulls).max() < 5
 
 
-def test_on_the_twin_a_injected_shear_is_found_and_told():
+def test_on_the_twin_an_injected_shear_is_recovered_and_reported():
     pulls = []
     for seed in (1, 2, 3):
         leaning = Registration(-16.0, -71.0, -0.77, 2.9, 0.0).with_shear(SHEAR)

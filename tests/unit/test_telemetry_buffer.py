@@ -1,4 +1,4 @@
-"""What a tape keeps of a loop, and how it is kept on disk."""
+"""The telemetry buffer of a loop, and its file."""
 
 from __future__ import annotations
 

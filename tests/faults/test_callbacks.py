@@ -1,4 +1,4 @@
-"""Those who look at a running bench: what they see is what passes, and their failure is theirs alone."""
+"""Callbacks on a running bench receive the data that pass, and their failures do not affect it."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from escape_hw.calibration.loop.runner import RunningLoop
 
 
 class Seen:
-    """Copies what every tap is told."""
+    """Copies the arguments of every callback."""
 
     def __init__(self) -> None:
         self.frames, self.images, self.slopes, self.commands, self.residuals = [], [], [], [], []
@@ -40,7 +40,7 @@ def closed(bench, good, frames=60):
     return loop, seen
 
 
-def test_taps_see_what_passes(bench, good):
+def test_callbacks_receive_what_passes(bench, good):
     look = Seen()
     bench.callbacks = look.callbacks()
     loop, seen = closed(bench, good, 300)
@@ -59,7 +59,7 @@ def test_taps_see_what_passes(bench, good):
     assert len(look.images) >= loop.record.science.count > 0
 
 
-def test_nobody_looks_unless_asked(bench, good):
+def test_no_callback_unless_set(bench, good):
     assert bench.callbacks == Callbacks()
     assert (bench.wfs.callback, bench.dm.callback, bench.science.callback) == (None, None, None)
     assert type(build_slope_function(bench, good.grid)).__name__ == "ShackHartmannSlopes"
@@ -68,7 +68,7 @@ def test_nobody_looks_unless_asked(bench, good):
     assert (bench.wfs.callback, bench.dm.callback, bench.science.callback) == (None, None, None)
 
 
-def test_a_tap_that_fails_is_dropped_and_the_loop_goes_on(bench, good, caplog):
+def test_a_callback_that_fails_is_dropped_and_the_loop_continues(bench, good, caplog):
     calls = []
 
     def failing(*row):
@@ -84,7 +84,7 @@ def test_a_tap_that_fails_is_dropped_and_the_loop_goes_on(bench, good, caplog):
     assert len(calls) == 4
 
 
-def test_a_run_ends_with_the_same_numbers_whether_it_is_looked_at_or_not(good):
+def test_a_run_ends_with_the_same_numbers_with_and_without_observers(good):
     commands = []
     for look in (False, True):
         with small("twin.loss_probability=0") as bench:

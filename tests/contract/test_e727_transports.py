@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import cache
 
+from usb_bus import VENDOR, UsbBackend, UsbPipe
+
 from escape_drivers.pi.modulator import PiModulator, make_modulator
 from escape_drivers.pi.transports import SerialTransport, UsbTransport
 from escape_hw.config.loader import load_system
@@ -12,8 +14,7 @@ from escape_hw.config.system import SystemConfig
 from escape_hw.testing import Check, Factory, parametrize_device_checks
 from escape_sim.emulators.e727.controller import E727Controller
 from escape_sim.emulators.e727.state import ControllerSettings
-from escape_sim.emulators.e727.transports import FaultInjector, PtyServer, UsbPipe
-from escape_sim.emulators.e727.usb_backend import VENDOR, UsbBackend
+from escape_sim.emulators.e727.transports import FaultInjector, PtyServer
 
 MAKE = ControllerSettings(serial="SIMMOD", zeroed=True)
 

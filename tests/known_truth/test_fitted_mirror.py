@@ -82,7 +82,7 @@ def missed(made: np.ndarray, exact: np.ndarray) -> float:
 
 
 def compared(design: Design, noise: float, m2c: np.ndarray | None = None) -> np.ndarray:
-    """Errors ``(n_seeds, 2)`` of the matrix of the found mirror, and of alike actuators."""
+    """Errors ``(n_seeds, 2)`` of the matrix of the fitted mirror, and of the nominal one."""
     errors, basis = [], design.m2c if m2c is None else m2c
     for seed in SEEDS:
         zonal = injected(design, seed)
@@ -95,12 +95,12 @@ def compared(design: Design, noise: float, m2c: np.ndarray | None = None) -> np.
     return np.array(errors)
 
 
-def test_a_well_measured_mirror_is_found(design: Design) -> None:
+def test_a_well_measured_mirror_is_recovered(design: Design) -> None:
     found, alike = compared(design, 0.1).T
     assert (found < 0.25 * alike).all()
 
 
-def test_a_mirror_on_a_large_pedestal_is_found(design: Design) -> None:
+def test_a_mirror_with_a_large_pedestal_is_recovered(design: Design) -> None:
     errors = []
     for seed in SEEDS:
         zonal = injected(design, seed, 0.4)
@@ -113,7 +113,7 @@ def test_a_mirror_on_a_large_pedestal_is_found(design: Design) -> None:
     assert np.mean(errors) < 0.014
 
 
-def test_a_mirror_that_was_hardly_measured_is_left_alone(design: Design) -> None:
+def test_a_poorly_measured_mirror_is_not_changed(design: Design) -> None:
     """Noise of three times the elements' rms: single actuators cannot be told."""
     found, alike = compared(design, 3.0).T
     assert found.mean() < 1.05 * alike.mean()
@@ -127,7 +127,7 @@ def test_the_matrix_holds_for_modes_that_were_never_poked(design: Design) -> Non
     assert (found < 0.6 * alike).all()
 
 
-def test_departures_belong_to_actuators_and_not_to_modes(design: Design) -> None:
+def test_corrections_belong_to_actuators_and_not_to_modes(design: Design) -> None:
     zonal = injected(design, 0)
     estimate = sprint(measured(design, zonal, 0.1, 0), design.model)
     turn = np.random.default_rng(2).standard_normal((design.m2c.shape[1], 5))
@@ -138,7 +138,7 @@ def test_departures_belong_to_actuators_and_not_to_modes(design: Design) -> None
     np.testing.assert_allclose(turned, made @ turn, atol=1e-4 * np.abs(turned).max())
 
 
-def test_its_errors_know_of_single_actuators(design: Design) -> None:
+def test_its_errors_include_single_actuators(design: Design) -> None:
     zonal = injected(design, 0)
     estimate = sprint(measured(design, zonal, 1.0, 0), design.model, update_priors=True)
     made, sigma = compute_pseudo_synthetic_matrix(design.model, estimate, design.m2c)
@@ -151,7 +151,7 @@ def test_its_errors_know_of_single_actuators(design: Design) -> None:
     assert compute_pseudo_synthetic_matrix(design.model, sure, design.m2c)[1].mean() < sigma.mean()
 
 
-def test_alike_is_the_matrix_of_the_drawing(design: Design) -> None:
+def test_nominal_is_the_matrix_of_the_nominal_mirror(design: Design) -> None:
     matrix = measured(design, injected(design, 0), 0.1, 0)
     found = sprint(matrix, design.model)
     alike = sprint(matrix, design.model, actuator_model="nominal")
@@ -164,8 +164,8 @@ def test_alike_is_the_matrix_of_the_drawing(design: Design) -> None:
 
 
 @pytest.mark.parametrize("frames", [50, 400])
-def test_a_tenth_of_a_second_tells_unequal_actuators(frames: int) -> None:
-    """The whole bench, held against push-pull without turbulence."""
+def test_a_tenth_of_a_second_determines_unequal_actuators(frames: int) -> None:
+    """The whole bench, compared with push-pull without turbulence."""
     errors = []
     for seed in (1, 2):
         with System.from_config(small_system.configuration(seed=seed)) as bench:

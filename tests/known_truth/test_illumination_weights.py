@@ -1,4 +1,4 @@
-"""Pixels that a model is no model of: dirt on a telescope's pupil does not move the registration."""
+"""Slope weights: contamination of a telescope's pupil does not bias the registration."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ NOISE = 0.05
 
 
 class Selective:
-    """The same model, which knows where it does not hold."""
+    """The same model with a weight per slope."""
 
     def __init__(self, model: PyramidModel, trust: NDArray[np.float64]) -> None:
         self._model, self.slope_weights = model, trust
@@ -64,7 +64,7 @@ def errors(selective: bool, solver: Solver = "mixed-effects") -> NDArray[np.floa
 
 
 @pytest.mark.parametrize("solver", ["mixed-effects", "registration-only", "frozen-derivatives"])
-def test_slopes_that_are_not_trusted_do_not_move_the_registration(solver: Solver) -> None:
+def test_slopes_of_small_weight_do_not_move_the_registration(solver: Solver) -> None:
     with_all, without = (np.sqrt(np.mean(np.square(errors(one, solver)), axis=0)) for one in (False, True))
     # Scaling along x, the way the contaminated pixels look; a clean fit errs by hundredths of a per cent.
     assert with_all[3] > 0.3
@@ -73,7 +73,7 @@ def test_slopes_that_are_not_trusted_do_not_move_the_registration(solver: Solver
 
 
 @pytest.mark.parametrize(("system", "telescope"), [("maps-nir", True), ("razor-pywfs", False)])
-def test_only_a_telescopes_model_distrusts_dim_pixels(system: str, telescope: bool) -> None:
+def test_only_a_telescopes_model_reduces_the_weight_of_dim_pixels(system: str, telescope: bool) -> None:
     config = load_system(system, overrides=["sensor.n_sub=24", "basis.n_modes=20"])
     pupils = nominal_pupils(config)
     arc = np.zeros(pupils.valid.shape, bool)
@@ -85,7 +85,7 @@ def test_only_a_telescopes_model_distrusts_dim_pixels(system: str, telescope: bo
     assert (model.slope_weights > 0).all()
 
 
-def test_a_pupil_that_is_dim_all_over_is_trusted_all_over() -> None:
+def test_a_pupil_that_is_dim_everywhere_has_full_weights() -> None:
     config = load_system("maps-nir", overrides=["sensor.n_sub=24", "basis.n_modes=20"])
     pupils = nominal_pupils(config)
     dim = np.where(np.random.default_rng(1).random(pupils.valid.shape) < 0.7, 0.5, 1.0)

@@ -1,4 +1,4 @@
-"""A closed loop of a few slopes with a planted matrix, fast enough for statistics over seeds."""
+"""A closed loop of a few slopes with an injected matrix, fast enough for statistics over seeds."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ RESPONSE = np.array([0.0, 0.0, 0.45, 0.55, 0.0])
 
 @dataclass(frozen=True)
 class Recorded:
-    """What observers of a loop see, and the truth behind it."""
+    """Observed data of a loop, and the true values."""
 
     index: np.ndarray
     slopes: np.ndarray
@@ -33,8 +33,8 @@ class Recorded:
         return estimator.extend(self.index, self.slopes, excitation).solve()
 
 
-def air(rng, frames, rms=0.3, pole=0.98):
-    """Turbulence of every slope ``(frames, N_SLOPES)``: the mirror can make most of it, and not all."""
+def turbulence(rng, frames, rms=0.3, pole=0.98):
+    """Turbulence of every slope ``(frames, N_SLOPES)``: most of it is in the span of the mirror."""
     kicks = rng.standard_normal((frames + 300, N_SLOPES)) * np.sqrt(1 - pole**2)
     return rms * lfilter([1.0], [1.0, -pole], kicks, axis=0)[300:]
 
@@ -48,21 +48,21 @@ def loop(
     noise=2e-3,
     limit=np.inf,
     lost=0.0,
-    believed=1.0,
+    matrix_scale=1.0,
     law=None,
     extra=None,
 ):
-    """Run the loop; pokes stand beside the integrator, ``limit`` shortens whole commands.
+    """Run the loop; pokes are added to the integrator, ``limit`` scales whole commands down.
 
-    ``believed`` scales the matrix that the loop is closed with, ``law`` is a function on the
+    ``matrix_scale`` scales the matrix that the loop is closed with, ``law`` is a function on the
     controller's command, ``extra`` is added to the turbulence ``(frames, N_SLOPES)``.
     """
     rng = np.random.default_rng(seed)
     truth = rng.standard_normal((N_SLOPES, N_MODES))
-    modal = air(rng, frames) @ np.linalg.pinv(truth).T @ truth.T
-    outside = modal + air(rng, frames, 0.05) + rng.normal(0, noise, (frames, N_SLOPES))
+    modal = turbulence(rng, frames) @ np.linalg.pinv(truth).T @ truth.T
+    outside = modal + turbulence(rng, frames, 0.05) + rng.normal(0, noise, (frames, N_SLOPES))
     outside += 0 if extra is None else extra
-    control = LeakyIntegrator(np.linalg.pinv(truth * believed).astype(np.float32), gain, leak)
+    control = LeakyIntegrator(np.linalg.pinv(truth * matrix_scale).astype(np.float32), gain, leak)
     pokes = rng.uniform(-poke, poke, (frames, N_MODES))
     there = rng.random(frames) >= lost
     there[0] = True

@@ -1,4 +1,4 @@
-"""No light, or a mirror that nobody sees: an error that says so, never a matrix of noise."""
+"""No light, or a mirror outside the beam: an error, never a matrix of noise."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def test_a_blocked_beam(good, name):
 
 
 @pytest.mark.parametrize("name", ["docrime on a grid", "closed_loop"])
-def test_light_that_goes_out_in_the_middle(good, name):
+def test_light_that_is_lost_in_the_middle(good, name):
     procedure, message = BLOCKED[name]
     with small() as bench:
         running = procedure(bench, good)
@@ -62,7 +62,7 @@ def test_light_that_goes_out_in_the_middle(good, name):
 
 
 def test_a_blink_of_the_light_is_survived(good):
-    """A few dark frames are not the end: the loop goes on where it was."""
+    """The loop continues after a few dark frames."""
     with small() as bench:
         blinks = iter(range(10**6))
         take = bench.wfs._next_frame
@@ -107,7 +107,7 @@ def test_a_mirror_that_is_not_in_the_beam_stops_the_other_methods_too():
         assert_flat(bench)
 
 
-def test_a_faint_response_is_told_by_its_errors():
+def test_a_faint_response_shows_in_its_errors():
     """Just seen, a matrix comes out with errors as large as itself, and a note."""
     with small("devices.dm.stroke_m=3e-8") as bench:
         result = bench.run(docrime(bench, frames=1500))

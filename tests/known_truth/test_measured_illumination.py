@@ -1,4 +1,4 @@
-"""A telescope's pupil is taken to be lit as its images say."""
+"""The model of a telescope has the illumination measured in the pupil images."""
 
 from __future__ import annotations
 

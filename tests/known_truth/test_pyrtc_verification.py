@@ -1,4 +1,4 @@
-"""Two proofs with pyRTC itself: our matrix closes its loop, and SPRINT betters a matrix that it measured."""
+"""Two tests with pyRTC: ESCAPE's matrix closes its loop, and SPRINT improves a matrix measured by pyRTC."""
 
 from __future__ import annotations
 
@@ -102,9 +102,10 @@ def test_a_matrix_of_ours_closes_pyrtcs_loop(tmp_path: Path, command: Callable[.
 
 def measured_by_pyrtc(folder: Path, geometry: CalibrationResult, seed: int) -> Path:
     """pyRTC's push-pull through turbulence on our twin; returns its configuration."""
-    from escape_drivers.pyrtc_components import EscapeCamera, EscapeMirror, clear_shared_benches
+    from escape_drivers import pyrtc_components
+    from escape_drivers.pyrtc_components import EscapeCamera, EscapeMirror
 
-    clear_shared_benches()
+    pyrtc_components._benches.clear()
     paths = export_matrix(folder, geometry, FrameSettings((200, 200), 12.0))
     found = sections(paths["settings"])
     ours = {"system": "razor-shwfs", "set": [*TWIN, f"system.seed={seed}"]}
@@ -151,6 +152,6 @@ def test_a_matrix_measured_by_pyrtc_is_improved_by_sprint(
     found = {name: value["value"] for name, value in told["registration"].items()}
     print(f"pyRTC's push-pull {errors['im']:.3f}, SPRINT's matrix {errors['escape']:.3f}; {found}")
     assert errors["escape"] < 0.5 * errors["im"]
-    planted = escape_hw.load_system("razor-shwfs").twin.registration
-    assert abs(found["shift_x"] - planted.shift_x) < 15
-    assert abs(found["shift_y"] - planted.shift_y) < 15
+    injected = escape_hw.load_system("razor-shwfs").twin.registration
+    assert abs(found["shift_x"] - injected.shift_x) < 15
+    assert abs(found["shift_y"] - injected.shift_y) < 15

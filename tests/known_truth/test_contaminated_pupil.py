@@ -1,4 +1,4 @@
-"""A pupil whose rim is eaten into: its centre by the shadow in it, and an error that knows of the rim."""
+"""A pupil with a contaminated rim: its centre from the shadow, and an error that includes the rim."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def test_without_an_obscuration_there_is_no_shadow() -> None:
     assert build_shadow(TelescopeSection(), DIAMETER_M) is None
 
 
-def test_an_eaten_rim_shifts_its_circle_and_the_error_knows() -> None:
+def test_a_contaminated_rim_shifts_its_circle_and_the_error_includes_it() -> None:
     rim, both, stated = [], [], []
     for seed in range(6):
         rng = np.random.default_rng(seed)
@@ -84,7 +84,7 @@ def test_an_eaten_rim_shifts_its_circle_and_the_error_knows() -> None:
     assert 0 < sigma[1] < 3 * by_both
 
 
-def test_a_whole_rim_is_round() -> None:
+def test_a_clean_rim_is_round() -> None:
     rng = np.random.default_rng(3)
     whole = frame(NOMINAL, rng, 0.0, noise=0.002).astype(float)
     soiled = frame(NOMINAL, np.random.default_rng(3), 0.03, noise=0.002).astype(float)

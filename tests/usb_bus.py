@@ -1,23 +1,65 @@
-"""A pyusb backend with the emulated controller on its bus, for a driver in the same process."""
-
-# ruff: noqa: D102 - the methods are those of pyusb's IBackend
+"""The emulated E-727 on a bus of pyusb, for a driver in the same process, and its trigger pulses."""
 
 from __future__ import annotations
 
 import errno
+import time
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import usb.backend
 import usb.core
+from numpy.typing import NDArray
 
-from escape_sim.emulators.e727.transports import UsbPipe
+from escape_sim.emulators.e727.controller import E727Controller
+from escape_sim.emulators.e727.stage import SERVO_S, Wave
+from escape_sim.emulators.e727.transports import ClientSession, ConnectionCut, FaultInjector
 
 #: PI's vendor number, and a product number in place of one that is not public.
 VENDOR, PRODUCT = 0x1A72, 0x1000
 _OUT, _IN, _BULK, _PACKET = 0x02, 0x81, 0x02, 64
 #: Request for a string descriptor, and index of the serial number's string.
 _GET_DESCRIPTOR, _STRING, _SERIAL = 0x06, 0x03, 3
+
+
+class UsbPipe:
+    """Bulk endpoints of the controller, for a replacement of libusb."""
+
+    def __init__(self, controller: E727Controller, faults: FaultInjector) -> None:
+        self._controller = controller
+        self.client_session = ClientSession(controller, faults)
+        self._outgoing = bytearray()
+        self.is_plugged = True
+
+    @property
+    def serial(self) -> str:
+        """Serial number in the device's descriptor."""
+        return self._controller.settings.serial
+
+    def write(self, data: bytes) -> None:
+        """Bulk transfer to the controller; raises ConnectionError if it is unplugged."""
+        if not self.is_plugged:
+            raise ConnectionError
+        if len(data) % 2:
+            self._controller.state.report_violation(
+                f"a USB transfer of {len(data)} bytes; pad it to an even number"
+            )
+        try:
+            self._outgoing += self.client_session.feed(data)
+        except ConnectionCut:
+            self.is_plugged = False
+            raise ConnectionError from None
+
+    def read(self, size: int, timeout_s: float) -> bytes:
+        """Bulk transfer from the controller; empty after ``timeout_s``. ConnectionError if unplugged."""
+        deadline = time.monotonic() + timeout_s
+        while not self._outgoing and time.monotonic() < deadline:
+            if not self.is_plugged:
+                raise ConnectionError
+            time.sleep(min(0.002, timeout_s))
+        data, self._outgoing = bytes(self._outgoing[:size]), self._outgoing[size:]
+        return data
 
 
 class UsbBackend(usb.backend.IBackend):  # type: ignore[misc]
@@ -133,3 +175,17 @@ class UsbBackend(usb.backend.IBackend):  # type: ignore[misc]
 
 def _no_device_error() -> Any:
     return usb.core.USBError("No such device (it may have been disconnected)", -4, errno.ENODEV)
+
+
+def pulses_s(controller: E727Controller, line: int, name: str) -> NDArray[np.float64]:
+    """Times of rising edges within one cycle ``(n,)`` in seconds; empty without trigger."""
+    waves, wave = controller.waves, controller.state.stage.axes[name].trajectory
+    levels = waves.levels.get(line, {})
+    if waves.outputs.get((line, 3)) != 4 or not levels or not isinstance(wave, Wave):
+        return np.empty(0)
+    level, points = 0, []
+    for point in range(1, len(wave.table) + 1):
+        before, level = level, levels.get(point, level)
+        if level > before:
+            points.append(point - 1)
+    return np.array(points, float) * wave.rate * SERVO_S

@@ -84,7 +84,7 @@ def test_a_result_is_a_few_lines(name: str) -> None:
         assert words in text
 
 
-def test_products_tell_their_file_and_not_their_configuration(tmp_path: Path) -> None:
+def test_products_name_their_file_and_not_their_configuration(tmp_path: Path) -> None:
     path = save_matrix(tmp_path / "im.fits", fake.calibration(), fake.ORIGIN)
     text = repr(load_matrix(path))
     assert text.startswith(f"<MatrixProduct {path}: <CalibrationResult of 10000 frames")

@@ -1,6 +1,9 @@
-"""The real drivers of a pyramid's bench, its modulator's too, on the simulated bench."""
+"""The real drivers of a pyramid bench, including the modulator's, on the simulated bench."""
 
 from __future__ import annotations
+
+import os
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -9,7 +12,7 @@ from driver_bench import stand_in
 from escape_hw.config.loader import load_system
 from escape_hw.runtime.session.system import System
 from escape_sim.devices.twins import shared_bench
-from escape_sim.stand_ins.bench_server import StandInBenchServer, stand_in_environment
+from escape_sim.stand_ins.bench_server import StandInBenchServer
 
 #: A small pyramid on increments of the real camera.
 SMALL = (
@@ -27,7 +30,7 @@ def test_the_modulators_driver_turns_the_twins_beam() -> None:
     for name in ("asdk", "m3api", "aravis"):
         stand_in(name).clear(record=False)
     config = load_system("razor-pywfs", overrides=SMALL)
-    with StandInBenchServer(config) as server, stand_in_environment(server):
+    with StandInBenchServer(config) as server, patch.dict(os.environ, server.environment):
         circle = shared_bench(config, server.shared).beam_path
         with System.from_config(load_system("razor-pywfs", mode="hardware", overrides=SMALL)) as bench:
             assert bench.simulated

@@ -1,4 +1,4 @@
-"""What procedures show on their way: the matrix as it fills in, SPRINT's iterations, gains, the track."""
+"""Live data of procedures: the matrix during acquisition, SPRINT's iterations, gains, the track."""
 
 from __future__ import annotations
 
