@@ -15,8 +15,7 @@ class ExponentialInfluenceFunctions:
     """Rounded exponentials, one set of parameters per actuator.
 
     The surface per unit command at a distance of ``r`` pitches in the direction ``theta`` is ``gain (1 + s u)
-    (1 + f t cos 4 theta) exp(-(sqrt(r^2 + w^2) - w) / L)`` with the distance ``u`` along ``outward`` in pitches,
-    limited to one, and ``t = r^4 / (r^2 + w^2)^2``. Scalings and rotation of a registration act on the whole
+    (1 + f t cos 4 theta) exp(-(sqrt(r^2 + w^2) - w) / L)`` with the distance ``u`` outwards in pitches and ``t = r^4 / (r^2 + w^2)^2``. Scalings and rotation of a registration act on the whole
     surface, shapes included.
 
     Parameters
@@ -72,33 +71,53 @@ class ExponentialInfluenceFunctions:
                 profile *= 1 + self.fourfold[a] * (u**4 - 6 * u**2 * v**2 + v**4) / rounded2**2
             if self.slope[a]:
                 along = u * outward[a, 0] + v * outward[a, 1]
-                profile *= 1 + self.slope[a] * np.clip(along, -1, 1)
+                profile *= 1 + self.slope[a] * along
             out[a] = self.gain[a] * profile
         return out
 
 
-def edge_actuators(positions_m: NDArray[np.float64], pitch_m: float) -> NDArray[np.bool_]:
-    """Actuators with fewer than the usual number of neighbours within 1.3 pitches ``(n_act,)``."""
-    distance = np.linalg.norm(positions_m[:, None] - positions_m, axis=2)
-    neighbours = (distance < 1.3 * pitch_m).sum(axis=1)
-    return np.asarray(neighbours < np.median(neighbours))
+#: Ranges of the measured ALPAO DM97-15 mirrors: length and rounding in pitches, four-fold term.
+_LENGTH, _ROUNDING, _FOURFOLD = (0.75, 1.05), (0.18, 0.35), (-0.02, 0.04)
+#: Their edge actuators: relative length and gain beyond the others, and asymmetry per pitch outwards.
+_EDGE_LENGTH, _EDGE_GAIN, _EDGE_SLOPE = 0.05, 0.12, 0.06
+#: Width of the ring of edge actuators in pitches.
+_EDGE_RING = 0.75
+#: Scatter of the positions in pitches.
+_POSITION_SCATTER = 0.01
 
 
-def draw_alpao_like(
-    positions_m: NDArray[np.float64], pitch_m: float, rng: np.random.Generator
+def draw_exponential(
+    positions_m: NDArray[np.float64],
+    pitch_m: float,
+    rng: np.random.Generator,
+    *,
+    gain_scatter: float,
+    length_scatter: float,
+    coupling: float | None = None,
 ) -> ExponentialInfluenceFunctions:
     """Draw a mirror as the measured ALPAO DM97-15 mirrors are.
 
-    Lengths of 0.75 to 1.05 pitches, 2 % scatter between actuators and 5 % more at the edge; roundings of 0.18 to
-    0.35; a four-fold term of -2 to 4 %; gains that scatter by 6 to 9 %, at the edge 12 % larger; edge actuators
-    6 % per pitch higher outwards; positions to 1 % of the pitch.
+    Parameters
+    ----------
+    positions_m, pitch_m
+        Nominal positions ``(n_act, 2)`` as (x, y) and pitch on the pupil in metres.
+    rng
+        Generator of the draw.
+    gain_scatter, length_scatter
+        Scatter of the gains and lengths between actuators, rms fractions.
+    coupling
+        Relative surface one pitch away, which sets the length; drawn if absent.
     """
-    n, edge = len(positions_m), edge_actuators(positions_m, pitch_m)
-    length = rng.uniform(0.75, 1.05) * (1 + 0.02 * rng.standard_normal(n)) * np.where(edge, 1.05, 1.0)
-    rounding = np.full(n, rng.uniform(0.18, 0.35))
-    fourfold = np.full(n, rng.uniform(-0.02, 0.04))
-    gain = (1 + rng.uniform(0.06, 0.09) * rng.standard_normal(n)) * np.where(edge, 1.12, 1.0)
-    positions = positions_m + 0.01 * pitch_m * rng.standard_normal((n, 2))
+    radius = np.linalg.norm(positions_m, axis=1)
+    n, edge = len(positions_m), radius > radius.max() - _EDGE_RING * pitch_m
+    length, rounding = rng.uniform(*_LENGTH), rng.uniform(*_ROUNDING)
+    if coupling is not None:
+        length = (np.hypot(1, rounding) - rounding) / -np.log(coupling)
+    fourfold = rng.uniform(*_FOURFOLD)
+    gain = 1 + gain_scatter * rng.standard_normal(n)
+    lengths = length * (1 + length_scatter * rng.standard_normal(n))
     return ExponentialInfluenceFunctions(
-        positions, pitch_m, length, rounding, gain, fourfold, np.where(edge, 0.06, 0.0)
-    )
+        positions_m + _POSITION_SCATTER * pitch_m * rng.standard_normal((n, 2)), pitch_m,
+        lengths * np.where(edge, 1 + _EDGE_LENGTH, 1.0), np.full(n, rounding),
+        gain * np.where(edge, 1 + _EDGE_GAIN, 1.0), np.full(n, fourfold), np.where(edge, _EDGE_SLOPE, 0.0),
+    )  # fmt: skip
