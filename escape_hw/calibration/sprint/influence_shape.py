@@ -21,12 +21,14 @@ from escape_hw.calibration.modes.derivatives import zonal_jacobian
 #: Widths of the components of the radial profile, relative to the nominal one.
 PROFILE_WIDTHS = (0.35, 0.6, 1.7, 2.9)
 #: Lobes of the four-fold terms: distance in pitches, and width relative to the nominal one.
-_FOURFOLD_LOBES = ((0.7, 0.6), (1.4, 1.0))
+_FOURFOLD_LOBES = ((0.4, 0.35), (0.8, 0.6), (1.6, 1.0))
 _N_LOBES = 8
 #: Prior standard deviations of the coefficients: shares of the profile, four-fold terms, and gain, width, shares and
 #: outward asymmetry (per pitch) of the edge actuators. They only regularise: measured mirrors have a third of them.
 _PROFILE_SIGMA, _FOURFOLD_SIGMA = 0.3, 0.05
 _EDGE_GAIN_SIGMA, _EDGE_WIDTH_SIGMA, _EDGE_PROFILE_SIGMA, _EDGE_ASYMMETRY_SIGMA = 0.2, 0.1, 0.1, 0.1
+#: Changes of registration, in its units, and width below which these terms, a few per cent of the matrix, are kept.
+_KEEP_WITHIN = np.array([5.0, 5.0, 0.1, 0.2, 0.2, 0.01])
 #: Actuators closer than this many pitches are neighbours.
 _NEIGHBOUR_DISTANCE = 1.3
 #: Squared standard deviation of a Gaussian of coupling 0.4 in squared pitches: the scale of the asymmetry.
@@ -89,6 +91,8 @@ class InfluenceShape:
             sigma += [_FOURFOLD_SIGMA] * len(_FOURFOLD_LOBES) + [_EDGE_GAIN_SIGMA, _EDGE_WIDTH_SIGMA]
             sigma += [_EDGE_PROFILE_SIGMA] * n + [_EDGE_ASYMMETRY_SIGMA] * (n + 1)
         self.prior_sigma = np.array(sigma)
+        self._fourfold_at: NDArray[np.float64] | None = None
+        self._fourfold: list[NDArray[np.float64]] = []
 
     @property
     def n_terms(self) -> int:
@@ -130,6 +134,9 @@ class InfluenceShape:
 
     def _fourfold_terms(self, registration: Registration, width: float) -> list[NDArray[np.float64]]:
         """Lobes along the axes of the mirror less those between them; their derivatives are neglected."""
+        at = np.append(registration.to_array(), width)
+        if self._fourfold_at is not None and (np.abs(at - self._fourfold_at) < _KEEP_WITHIN).all():
+            return self._fourfold
         affine, _ = registration.affine(self._model.sub_aperture_m)
         terms = []
         for distance, relative_width in _FOURFOLD_LOBES:
@@ -145,6 +152,7 @@ class InfluenceShape:
                 lobe = (-1) ** number * self._model.zonal_matrix(shifted, width * relative_width)
                 term = lobe if number == 0 else term + lobe
             terms.append(term)
+        self._fourfold_at, self._fourfold = at, terms
         return terms
 
 
