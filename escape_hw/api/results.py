@@ -15,6 +15,7 @@ from escape_hw.api.representation import line_html, short_repr, table_html
 from escape_hw.api.sensor import SensorGeometry
 from escape_hw.deprecation import renamed_members
 
+
 @dataclass(frozen=True, slots=True, eq=False)
 class ActuatorCorrections:
     """Fitted differences between the actuators and the nominal ones.
@@ -32,7 +33,8 @@ class ActuatorCorrections:
         Coefficients of the common shape of the influence functions
         (:class:`~escape_hw.calibration.sprint.influence_shape.InfluenceShape`).
     position
-        Position of every actuator along x and y beyond the nominal one, in % of a sub-aperture ``(2, n_act)``.
+        Position of every actuator along x and y beyond the nominal one, in % of a sub-aperture ``(2,
+        n_act)``.
     """
 
     gain: NDArray[np.float64]

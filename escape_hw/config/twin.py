@@ -180,8 +180,8 @@ class TwinRegistration(Section):
 class TwinMirror(Section):
     """Deviations of the mirror from its data sheet.
 
-    The shape ``exponential`` is drawn from ``system.seed``, as measured ALPAO mirrors are: rounding, four-fold term,
-    positions and edge actuators, and the length unless ``coupling`` sets it.
+    The shape ``exponential`` is drawn from ``system.seed``, as measured ALPAO mirrors are: rounding,
+    four-fold term, positions and edge actuators, and the length unless ``coupling`` sets it.
     """
 
     shape: Literal["gaussian", "exponential", "thin-plate", "file"] = Field(

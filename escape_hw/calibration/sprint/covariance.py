@@ -134,12 +134,16 @@ def _positive_part(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _resampled_covariance(
-    total: NDArray[np.float64], scores: NDArray[np.float64], residual: NDArray[np.float64], modes: NDArray[np.float64]
+    total: NDArray[np.float64],
+    scores: NDArray[np.float64],
+    residual: NDArray[np.float64],
+    modes: NDArray[np.float64],
 ) -> NDArray[np.float64]:
     """Covariance of the common parameters from leaving out groups of actuators in turn ``(n, n)``.
 
-    The delete-group jackknife (Shao & Tu 1995, section 2.3) of the linearised solution. The score of an actuator
-    follows from the derivative of its column, ``J M^+``, and the residual that its commands cause, ``r M^T``.
+    The delete-group jackknife (Shao & Tu 1995, section 2.3) of the linearised solution. The score of an
+    actuator follows from the derivative of its column, ``J M^+``, and the residual that its commands cause,
+    ``r M^T``.
 
     Parameters
     ----------
@@ -175,8 +179,8 @@ def sandwich_covariance(
     only their excess over the noise is added, because the scores at a solution sum to zero and the window
     alone would underestimate the noise. Without a covariance of the noise the window is used for both, plus
     the scatter of the scores from mode to mode, which contains errors common to all slopes during the
-    measurement of a mode. What differences between the actuators can do to the parameters beyond that is estimated
-    by leaving out groups of them (:func:`_resampled_covariance`).
+    measurement of a mode. What differences between the actuators can do to the parameters beyond that is
+    estimated by leaving out groups of them (:func:`_resampled_covariance`).
 
     Parameters
     ----------

@@ -393,10 +393,7 @@ def _build_estimate(
         float(np.mean(np.square(solution.system.residual))),
         warnings,
         notes,
-        extras={
-            one.model.name: one.to_estimate(sigma, model_sigma)
-            for one in solution.extras
-        },
+        extras={one.model.name: one.to_estimate(sigma, model_sigma) for one in solution.extras},
     )
 
 
@@ -428,8 +425,8 @@ def check_convergence(
     if not steps_converged:
         warnings.append(f"the steps did not shrink within {len(context.history)} iterations")
     warnings += check_fit(
-        context.matrix, context.model, context.columns, weighted, solution.system.residual, solution.gain, gain_sigma,
-        Registration.from_array(solution.alpha),
+        context.matrix, context.model, context.columns, weighted, solution.system.residual, solution.gain,
+        gain_sigma, Registration.from_array(solution.alpha),
     )  # fmt: skip
     worst = int(np.argmax(sigma / MAX_STEP))
     if sigma[worst] > MAX_STEP[worst]:

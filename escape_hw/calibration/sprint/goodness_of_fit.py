@@ -1,7 +1,8 @@
 """Whether a solution of SPRINT may be used: what does not fit, and where.
 
-A fit counts as converged when its steps ended, the gain is significant, the registration is within what the search
-covers, the data constrain every parameter, and the model explains the matrix to within its noise and a small misfit.
+A fit counts as converged when its steps ended, the gain is significant, the registration is within what the
+search covers, the data constrain every parameter, and the model explains the matrix to within its noise and a
+small misfit.
 """
 
 from __future__ import annotations
@@ -16,8 +17,8 @@ from escape_hw.calibration.sprint.coarse_search import MIN_EXPLAINED_FRACTION
 from escape_hw.calibration.sprint.diagnostics import check_orientation
 from escape_hw.calibration.sprint.weighted_matrix import WeightedMatrix
 
-#: Largest rms of the residual beyond the noise, relative to that of the matrix. A tenth is what the best known
-#: description of a real mirror leaves; beyond it scalings and rotation are those of a wrong model.
+#: Largest rms of the residual beyond the noise, relative to that of the matrix. A tenth is what the best
+#: known description of a real mirror leaves; beyond it scalings and rotation are those of a wrong model.
 _MAX_MISFIT = 0.15
 #: Excess of the sum of squares, in its standard deviations for independent noise, that counts as a misfit.
 _SIGNIFICANT = 10.0
@@ -25,7 +26,8 @@ _SIGNIFICANT = 10.0
 _MIN_GAIN_SIGNIFICANCE = 5.0
 #: Largest scaling in % and rotation in degrees: the search covers half of them.
 _MAX_SCALING, _MAX_ROTATION = 20.0, 30.0
-#: A sub-aperture or actuator whose rms residual exceeds the median one by this factor is named, so many at most.
+#: A sub-aperture or actuator whose rms residual exceeds the median one by this factor is named, so many at
+#: most.
 _OUTLIER, _MAX_NAMED = 3.0, 12
 
 
@@ -85,7 +87,8 @@ def check_fit(
     matrix, model, columns
         The fitted columns of the measured matrix, and the synthetic model.
     weighted, residual
-        The matrix in units of its standard errors, and data minus model ``(n_slopes, n_modes)`` in the same units.
+        The matrix in units of its standard errors, and data minus model ``(n_slopes, n_modes)`` in the same
+        units.
     gain, gain_sigma, registration
         The solution.
     """
@@ -94,8 +97,8 @@ def check_fit(
     misfit = misfit_fraction(weighted, residual)
     if abs(gain) < _MIN_GAIN_SIGNIFICANCE * gain_sigma:
         reasons.append(
-            f"the gain is {gain:.3g} +- {gain_sigma:.2g}: the slopes hardly follow the commands; does the mirror move, "
-            "and does its light reach the sensor?"
+            f"the gain is {gain:.3g} +- {gain_sigma:.2g}: the slopes hardly follow the commands; does the "
+            "mirror move, and does its light reach the sensor?"
         )
     elif explained < MIN_EXPLAINED_FRACTION * signal or np.vdot(weighted.data - residual, weighted.data) <= 0:
         hint = check_orientation(matrix, model, columns)
@@ -110,9 +113,10 @@ def check_fit(
         )
     elif misfit > _MAX_MISFIT:
         outliers = describe_outliers(weighted, residual)
+        where = f"worst: {outliers}" if outliers else "no part stands out"
         reasons.append(
-            f"the model does not fit: {misfit:.0%} of the matrix remain beyond its noise (reduced chi-squared "
-            f"{np.mean(np.square(residual)):.3g}); {'worst: ' + outliers if outliers else 'no part stands out'}"
+            f"the model does not fit: {misfit:.0%} of the matrix remain beyond its noise (reduced "
+            f"chi-squared {np.mean(np.square(residual)):.3g}); {where}"
         )
     return reasons + _implausible_values(registration)
 
@@ -129,6 +133,7 @@ def _implausible_values(registration: Registration) -> list[str]:
             )
     if abs(registration.rotation) > _MAX_ROTATION:
         reasons.append(
-            f"rotation is {registration.rotation:.0f} degrees, beyond {_MAX_ROTATION:.0f}: check the layout and the flips"
+            f"rotation is {registration.rotation:.0f} degrees, beyond {_MAX_ROTATION:.0f}: check the layout "
+            "and the flips"
         )
     return reasons

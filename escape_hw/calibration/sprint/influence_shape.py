@@ -1,10 +1,10 @@
 """Common shape of the influence functions, fitted beside the registration.
 
-A model gives the slopes of nominal influence functions of any width. Sums of them approximate the mirrors that
-exist: a radial profile is a sum of nominal functions of several widths (an exponential of the distance, as of
-membrane mirrors, is a positive sum of Gaussians: Bernstein's theorem), a four-fold term is a ring of eight shifted
-functions of alternating sign, and the functions of edge actuators have shares and an outward asymmetry of their
-own. All terms are linear in the slopes.
+A model gives the slopes of nominal influence functions of any width. Sums of them approximate the mirrors
+that exist: a radial profile is a sum of nominal functions of several widths (an exponential of the distance,
+as of membrane mirrors, is a positive sum of Gaussians: Bernstein's theorem), a four-fold term is a ring of
+eight shifted functions of alternating sign, and the functions of edge actuators have shares and an outward
+asymmetry of their own. All terms are linear in the slopes.
 """
 
 from __future__ import annotations
@@ -23,11 +23,13 @@ PROFILE_WIDTHS = (0.35, 0.6, 1.7, 2.9)
 #: Lobes of the four-fold terms: distance in pitches, and width relative to the nominal one.
 _FOURFOLD_LOBES = ((0.4, 0.35), (0.8, 0.6), (1.6, 1.0))
 _N_LOBES = 8
-#: Prior standard deviations of the coefficients: shares of the profile, four-fold terms, and gain, width, shares and
-#: outward asymmetry (per pitch) of the edge actuators. They only regularise: measured mirrors have a third of them.
+#: Prior standard deviations of the coefficients: shares of the profile, four-fold terms, and gain, width,
+#: shares and outward asymmetry (per pitch) of the edge actuators. They only regularise: measured mirrors have
+#: a third of them.
 _PROFILE_SIGMA, _FOURFOLD_SIGMA = 0.3, 0.05
 _EDGE_GAIN_SIGMA, _EDGE_WIDTH_SIGMA, _EDGE_PROFILE_SIGMA, _EDGE_ASYMMETRY_SIGMA = 0.2, 0.1, 0.1, 0.1
-#: Changes of registration, in its units, and width below which these terms, a few per cent of the matrix, are kept.
+#: Changes of registration, in its units, and width below which these terms, a few per cent of the matrix, are
+#: kept.
 _KEEP_WITHIN = np.array([5.0, 5.0, 0.1, 0.2, 0.2, 0.01])
 #: Actuators closer than this many pitches are neighbours.
 _NEIGHBOUR_DISTANCE = 1.3
@@ -42,8 +44,8 @@ class ShapedMatrix:
     Parameters
     ----------
     nominal, base
-        Slopes per unit command of the nominal influence functions ``(n_slopes, n_act)``, and their derivatives
-        by the registration and the width ``(6, n_slopes, n_act)``.
+        Slopes per unit command of the nominal influence functions ``(n_slopes, n_act)``, and their
+        derivatives by the registration and the width ``(6, n_slopes, n_act)``.
     matrix, jacobian
         The same of the shaped ones.
     terms
@@ -60,8 +62,8 @@ class ShapedMatrix:
 class InfluenceShape:
     """Terms of the common shape of a model's influence functions.
 
-    Without the positions of the actuators (:class:`~escape_hw.api.synthetic_model.HasActuatorPositions`) only the
-    radial profile is fitted.
+    Without the positions of the actuators (:class:`~escape_hw.api.synthetic_model.HasActuatorPositions`) only
+    the radial profile is fitted.
 
     Parameters
     ----------

@@ -17,7 +17,7 @@ from escape_hw.api.results import ActuatorCorrections
 from escape_hw.api.synthetic_model import HasGainTrend, SyntheticModel
 from escape_hw.calibration.modes.derivatives import modal_matrix, zonal_jacobian
 from escape_hw.calibration.sprint.extra_parameters import ExtraParameterModel, FittedExtraParameter
-from escape_hw.calibration.sprint.influence_shape import InfluenceShape, ShapedMatrix
+from escape_hw.calibration.sprint.influence_shape import InfluenceShape
 from escape_hw.calibration.sprint.normal_equations import NormalEquations, Priors, normal_equations
 from escape_hw.calibration.sprint.weighted_matrix import WeightedMatrix
 
@@ -69,7 +69,7 @@ class MixedEffectsState:
 
 @dataclass(slots=True, eq=False)
 class _ZonalMatrices:
-    """Zonal matrices at a state, in standard errors: derivatives, terms of the shape, variants, and their sum."""
+    """Zonal matrices at a state, in standard errors: derivatives, terms, variants, and their sum."""
 
     jacobian: NDArray[np.float64]
     by_width: NDArray[np.float64]
@@ -223,7 +223,12 @@ class MixedEffectsProblem:
     ) -> NDArray[np.float64]:
         """Weighted derivatives by the effects of the actuators ``(n_effects, n_slopes, n_act)``."""
         return np.stack(
-            [z.total, z.by_width * actuator_factor, z.jacobian[0] * actuator_factor, z.jacobian[1] * actuator_factor]
+            [
+                z.total,
+                z.by_width * actuator_factor,
+                z.jacobian[0] * actuator_factor,
+                z.jacobian[1] * actuator_factor,
+            ]
         )
 
     def _slope_gains(self, state: MixedEffectsState) -> NDArray[np.float64]:
@@ -245,17 +250,19 @@ class MixedEffectsProblem:
         usual, inner = Priors(), len(system.schur_complement)
         names = [*groups, "slope_gain"]
         low, high = (
-            {name: ratio * getattr(usual, name) for name in names} for ratio in (_MIN_PRIOR_RATIO, _MAX_PRIOR_RATIO)
+            {name: ratio * getattr(usual, name) for name in names}
+            for ratio in (_MIN_PRIOR_RATIO, _MAX_PRIOR_RATIO)
         )
         # A misfit of the model enlarges the noise that the effects are compared with.
         rms = float(np.sqrt(np.mean(np.square(system.residual))))
         noise = max(rms, self.weighted.noise_level(system.residual))
         found = estimate_scatters(
-            system.schur_complement, self.offset(state)[:inner], self.precision[:inner], list(groups.values()),
-            [(low[name], high[name]) for name in groups], noise,
+            system.schur_complement, self.offset(state)[:inner], self.precision[:inner],
+            list(groups.values()), [(low[name], high[name]) for name in groups], noise,
         )  # fmt: skip
         scatter = dict(zip(groups, found, strict=True))
-        # The slope gains were eliminated: one step of expectation and maximisation (Dempster, Laird & Rubin 1977).
+        # The slope gains were eliminated: one step of expectation and maximisation (Dempster, Laird & Rubin
+        # 1977).
         variance = system.posterior_variance()
         mean_square = float(np.mean(np.square(state.slope_gain) + variance[inner:]))
         scatter["slope_gain"] = float(np.clip(np.sqrt(mean_square), low["slope_gain"], high["slope_gain"]))
@@ -277,7 +284,9 @@ class MixedEffectsProblem:
     def actuator_corrections(self, state: MixedEffectsState, system: NormalEquations) -> ActuatorCorrections:
         """Differences between the mirror of a solution and the nominal one."""
         inner = len(system.schur_complement)
-        variance = np.diag(np.linalg.inv(system.schur_complement))[inner - N_ACTUATOR_EFFECTS * self.model.n_act :]
+        variance = np.diag(np.linalg.inv(system.schur_complement))[
+            inner - N_ACTUATOR_EFFECTS * self.model.n_act :
+        ]
         noise = self.weighted.noise_level(system.residual)
         gain_sigma = noise * np.sqrt(variance[: self.model.n_act])
         gain, width, *position = state.actuator

@@ -162,7 +162,9 @@ class NormalEquations:
         out = np.empty_like(self.common)
         for p in range(k):
             by_line, by_trend, by_actuator = np.split(inner[:, p], ends)
-            acting = (self.actuator_derivatives * by_actuator.reshape(n_kinds, 1, n_act)).sum(axis=0) @ self.modes
+            acting = (self.actuator_derivatives * by_actuator.reshape(n_kinds, 1, n_act)).sum(
+                axis=0
+            ) @ self.modes
             out[p] = self.common[p] - acting - (by_slope[:, p] + self.trends @ by_trend)[:, None] * self.model
             if n_lines:
                 out[p] -= by_line[self.lines, None] * self.sampling_derivative

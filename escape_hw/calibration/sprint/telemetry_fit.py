@@ -186,7 +186,8 @@ def fit_telemetry(
             iteration_options["actuator_model"] = "nominal"
         fit = yield from fit_registration(
             frames.columns(template, response.weights, matrix, variance), model, start=start,
-            covariance=covariance, priors=priors, update_priors=False, coarse_search=start is None, **iteration_options,
+            covariance=covariance, priors=priors, update_priors=False, coarse_search=start is None,
+            **iteration_options,
         )  # fmt: skip
         start = fit.estimate.registration
         matrix = fit.zonal_matrix() @ template.m2c

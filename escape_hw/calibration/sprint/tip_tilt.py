@@ -1,7 +1,7 @@
 """Sensors that remove tip and tilt from their slopes.
 
-Some control systems subtract the mean x and y slope from every frame. Their interaction matrices have columns of
-zero mean, which a synthetic model reproduces when its columns are treated alike.
+Some control systems subtract the mean x and y slope from every frame. Their interaction matrices have columns
+of zero mean, which a synthetic model reproduces when its columns are treated alike.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from escape_hw.api.registration import Registration
 from escape_hw.api.synthetic_model import SyntheticModel
 from escape_hw.calibration.modes.derivatives import modal_jacobian, modal_matrix, zonal_jacobian
 
-#: Mean slope of a column relative to its rms below which its tip and tilt count as removed: rounding in single
-#: precision leaves 1e-6, a measured column about its noise over the root of the number of slopes.
+#: Mean slope of a column relative to its rms below which its tip and tilt count as removed: rounding in
+#: single precision leaves 1e-6, a measured column about its noise over the root of the number of slopes.
 _NEGLIGIBLE_MEAN = 1e-4
 
 

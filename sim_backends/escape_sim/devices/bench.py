@@ -290,8 +290,8 @@ class SimBench:
         shape = mirror.true_shape
         if shape == "exponential":
             return draw_exponential(
-                positions, pitch, truth, gain_scatter=mirror.gain_scatter, length_scatter=mirror.width_scatter,
-                coupling=mirror.coupling,
+                positions, pitch, truth, gain_scatter=mirror.gain_scatter,
+                length_scatter=mirror.width_scatter, coupling=mirror.coupling,
             )  # fmt: skip
         if shape == "gaussian":
             return InfluenceFunctions(

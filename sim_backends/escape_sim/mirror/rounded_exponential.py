@@ -1,4 +1,4 @@
-"""Influence functions shaped as those of membrane mirrors: rounded exponentials that differ between actuators."""
+"""Influence functions as of membrane mirrors: rounded exponentials that differ between actuators."""
 
 from __future__ import annotations
 
@@ -15,8 +15,9 @@ class ExponentialInfluenceFunctions:
     """Rounded exponentials, one set of parameters per actuator.
 
     The surface per unit command at a distance of ``r`` pitches in the direction ``theta`` is ``gain (1 + s u)
-    (1 + f t cos 4 theta) exp(-(sqrt(r^2 + w^2) - w) / L)`` with the distance ``u`` outwards in pitches and ``t = r^4 / (r^2 + w^2)^2``. Scalings and rotation of a registration act on the whole
-    surface, shapes included.
+    (1 + f t cos 4 theta) exp(-(sqrt(r^2 + w^2) - w) / L)`` with the distance ``u`` outwards in pitches and
+    ``t = r^4 / (r^2 + w^2)^2``. Scalings and rotation of a registration act on the whole surface, shapes
+    included.
 
     Parameters
     ----------

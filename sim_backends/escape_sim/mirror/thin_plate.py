@@ -1,9 +1,10 @@
 """Influence functions of a thin plate with free edges on springs at its actuators.
 
-The plate minimises its bending energy plus that of the springs (Timoshenko & Woinowsky-Krieger 1959, section 21):
-``D/2 integral [w_xx^2 + w_yy^2 + 2 nu w_xx w_yy + 2 (1 - nu) w_xy^2] + sum_a k/2 (w(x_a) - c_a)^2``. Finite differences
-of the energy give free edges without further conditions. Unlike Gaussians these functions have a negative ring, and
-those of edge actuators have another shape.
+The plate minimises its bending energy plus that of the springs (Timoshenko & Woinowsky-Krieger 1959, section
+21):
+``D/2 integral [w_xx^2 + w_yy^2 + 2 nu w_xx w_yy + 2 (1 - nu) w_xy^2] + sum_a k/2 (w(x_a) - c_a)^2``. Finite
+differences of the energy give free edges without further conditions. Unlike Gaussians these functions have a
+negative ring, and those of edge actuators have another shape.
 """
 
 from __future__ import annotations
