@@ -69,7 +69,7 @@ class LowRankNoise:
 
 
 #: Groups of actuators that are left out in turn.
-_N_GROUPS = 10
+_N_GROUPS = 20
 
 
 def systematic_error(model: SyntheticModel) -> NDArray[np.float64]:

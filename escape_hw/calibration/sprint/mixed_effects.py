@@ -112,7 +112,8 @@ class MixedEffectsProblem:
         self.shape = InfluenceShape(model)
         self.trends = slope_trends(model, weighted.valid)
         self.precision = np.concatenate([
-            np.zeros(6), [priors.width**-2], self.shape.prior_sigma**-2.0, scatters**-2,
+            np.zeros(6), [priors.width**-2], (priors.shape_scale * self.shape.prior_sigma) ** -2.0,
+            scatters**-2,
             np.full(self.n_lines, priors.sampling**-2), np.ones(self.trends.shape[1]),
             *(np.full(model.n_act, self._actuator_precision(name)) for name in _ACTUATOR_PRIORS),
             np.full(weighted.data.shape[0], priors.slope_gain**-2),
@@ -248,24 +249,25 @@ class MixedEffectsProblem:
         """Estimate the scatter of the random effects from a solution (:func:`estimate_scatters`)."""
         groups = self._effect_groups(system)
         usual, inner = Priors(), len(system.schur_complement)
-        names = [*groups, "slope_gain"]
-        low, high = (
-            {name: ratio * getattr(usual, name) for name in names}
-            for ratio in (_MIN_PRIOR_RATIO, _MAX_PRIOR_RATIO)
-        )
+        bounds = {
+            name: (_MIN_PRIOR_RATIO * getattr(usual, name), _MAX_PRIOR_RATIO * getattr(usual, name))
+            for name in (*groups, "slope_gain")
+        }
         # A misfit of the model enlarges the noise that the effects are compared with.
         rms = float(np.sqrt(np.mean(np.square(system.residual))))
         noise = max(rms, self.weighted.noise_level(system.residual))
-        found = estimate_scatters(
+        present = np.array([getattr(self.priors, name) for name in groups])
+        ratios = estimate_scatters(
             system.schur_complement, self.offset(state)[:inner], self.precision[:inner],
-            list(groups.values()), [(low[name], high[name]) for name in groups], noise,
+            list(groups.values()),
+            [np.divide(bounds[name], scatter) for name, scatter in zip(groups, present, strict=True)], noise,
         )  # fmt: skip
-        scatter = dict(zip(groups, found, strict=True))
+        scatter = dict(zip(groups, (present * ratios).tolist(), strict=True))
         # The slope gains were eliminated: one step of expectation and maximisation (Dempster, Laird & Rubin
         # 1977).
         variance = system.posterior_variance()
         mean_square = float(np.mean(np.square(state.slope_gain) + variance[inner:]))
-        scatter["slope_gain"] = float(np.clip(np.sqrt(mean_square), low["slope_gain"], high["slope_gain"]))
+        scatter["slope_gain"] = float(np.clip(np.sqrt(mean_square), *bounds["slope_gain"]))
         inflation = system.estimate_noise_inflation() if self.trends.shape[1] else 1.0
         priors = replace(self.priors, **scatter, noise_inflation=inflation)
         return PriorEstimate(priors, float(np.sum(1 - variance * self.precision)))
@@ -275,7 +277,7 @@ class MixedEffectsProblem:
         inner, n_act = len(system.schur_complement), self.model.n_act
         first = inner - N_ACTUATOR_EFFECTS * n_act
         lines = np.arange(first - self.trends.shape[1] - self.n_lines, first - self.trends.shape[1])
-        groups = {"sampling": lines}
+        groups = {"shape_scale": np.arange(SHAPE, self.first_variant), "sampling": lines}
         for number, name in enumerate(_ACTUATOR_PRIORS):
             members = np.arange(first + number * n_act, first + (number + 1) * n_act)
             groups[name] = np.concatenate([groups[name], members]) if name in groups else members
@@ -343,10 +345,10 @@ def estimate_scatters(
     value: NDArray[np.float64],
     precision: NDArray[np.float64],
     groups: Sequence[NDArray[np.intp]],
-    bounds: Sequence[tuple[float, float]],
+    bounds: Sequence[Sequence[float] | NDArray[np.float64]],
     noise: float = 1.0,
 ) -> NDArray[np.float64]:
-    """Scatter of groups of random effects that maximises the evidence ``(n_groups,)``.
+    """Scatter of groups of random effects that maximises the evidence, relative to the present one.
 
     The variance of each group is the fixed point ``sum x^2 / sum(1 - var / scatter^2)`` (MacKay 1992, eq.
     4.9 and 4.10), with a few zero effects added to the count. Unlike a chosen prior, it goes to its lower
@@ -361,24 +363,30 @@ def estimate_scatters(
     precision
         Present prior precisions ``(n,)``.
     groups
-        Indices of the unknowns that share a scatter.
+        Indices of the unknowns that share a factor on their prior scatter.
     bounds
-        Smallest and largest scatter of each group.
+        Smallest and largest factor of each group.
     noise
         Noise of the data in the units of ``information``.
+
+    Returns
+    -------
+    ndarray, ``(n_groups,)``
     """
-    data = (information - np.diag(precision)) / noise**2
+    # In units of the prior scatter, where there is one.
+    unit = np.where(precision > 0, np.maximum(precision, 1e-300) ** -0.5, 1.0)
+    data = (information - np.diag(precision)) * np.outer(unit, unit) / noise**2
     # The gradient vanishes at the solution.
-    right_hand_side = information @ value / noise**2
-    prior, scatters = precision.copy(), np.array([precision[group[0]] ** -0.5 for group in groups])
+    right_hand_side = unit * (information @ value) / noise**2
+    prior, ratios = (precision > 0).astype(float), np.ones(len(groups))
     for _ in range(_ITERATIONS):
         covariance = np.linalg.inv(data + np.diag(prior))
-        posterior_mean, before = covariance @ right_hand_side, scatters.copy()
+        posterior_mean, before = covariance @ right_hand_side, ratios.copy()
         for number, (group, (smallest, largest)) in enumerate(zip(groups, bounds, strict=True)):
             n_determined = float(np.sum(1 - np.diag(covariance)[group] * prior[group]))
             square = np.square(posterior_mean[group]).sum() / (n_determined + _PSEUDO_COUNT)
-            scatters[number] = np.clip(np.sqrt(square), smallest, largest)
-            prior[group] = scatters[number] ** -2
-        if (np.abs(scatters / before - 1) < _NEGLIGIBLE_CHANGE).all():
+            ratios[number] = np.clip(np.sqrt(square), smallest, largest)
+            prior[group] = ratios[number] ** -2
+        if (np.abs(ratios / before - 1) < _NEGLIGIBLE_CHANGE).all():
             break
-    return scatters
+    return ratios

@@ -33,6 +33,9 @@ class Priors:
         pixels.
     width
         Common width of the influence functions.
+    shape_scale
+        Scatter of the coefficients of their shape, relative to that of
+        :class:`~.influence_shape.InfluenceShape`.
     mean_width
         Prior mean of the relative width beyond nominal: zero, or the value of an earlier fit.
     extras
@@ -49,6 +52,7 @@ class Priors:
     actuator_position: float = 5.0
     slope_gain: float = 0.1
     width: float = 0.2
+    shape_scale: float = 1.0
     sampling: float = 0.5
     mean_width: float = 0.0
     extras: tuple[tuple[float, float], ...] = ()
