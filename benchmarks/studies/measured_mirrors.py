@@ -1,10 +1,12 @@
 """Registration and influence functions of a real ALPAO DM97 from its matrices of 25 dates.
 
-    python benchmarks/studies/measured_mirrors.py --data ../shared/data/dm97 --out docs/studies/measured-mirrors
+    python benchmarks/studies/measured_mirrors.py --data ../shared/data/dm97 --out
+    docs/studies/measured-mirrors
 
-Writes ``dm97.jsonl``, one line per date: registration, errors, residual, shape; and for successive dates what the
-synthetic matrix of the earlier one, at the registration of the later, leaves of the later measured matrix, beside
-what the earlier measured matrix leaves, and the eigenvalues of the loop with the synthetic matrix. Takes two minutes.
+Writes ``dm97.jsonl``, one line per date: registration, errors, residual, shape; and for successive dates what
+the synthetic matrix of the earlier one, at the registration of the later, leaves of the later measured
+matrix, beside what the earlier measured matrix leaves, and the eigenvalues of the loop with the synthetic
+matrix. Takes two minutes.
 """
 
 from __future__ import annotations
@@ -13,10 +15,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from escape_benchmarks.measured.dm97 import fit_matrix, make_model, read_entries, read_matrix
 from numpy.typing import NDArray
 from realisation_tables import append_line, study_parser
 
+from escape_benchmarks.measured.dm97 import fit_matrix, make_model, read_entries, read_matrix
 from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.calibration.sprint.fit import SprintFit
 from escape_hw.calibration.sprint.synthetic_matrix import compute_fitted_matrix
@@ -62,8 +64,8 @@ def compare(
 def describe(line: dict[str, Any]) -> str:
     """One line for the terminal."""
     verdict = "converged" if line["converged"] else line["warnings"][0]
-    text = f"{line['date']}: {verdict}, {np.round(line['registration'], 2).tolist()}, leaves {line['leaves']:.3f}"
-    if "moved" in line:
+    text = f"{line['date']}: {verdict}, {np.round(line['registration'], 2).tolist()}, leaves
+    {line['leaves']:.3f}" if "moved" in line:
         text += f"; earlier measured matrix {line['measured_leaves']:.3f}"
         text += f", synthetic {line['synthetic_leaves']:.3f}, at this registration {line['moved_leaves']:.3f}"
         text += f", eigenvalues {line['eigenvalues'][0]:.2f} to {line['eigenvalues'][1]:.2f}"

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from escape_benchmarks.measured.dm97 import fit_matrix, read_matrix
 
+from escape_benchmarks.measured.dm97 import fit_matrix, read_matrix
 from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.calibration.sprint.fit import SprintFit
 

@@ -1,7 +1,7 @@
 """Interaction matrices of a real ALPAO DM97-15 with a Shack-Hartmann sensor.
 
-From the repository rjonnal/ciao3 (commit 62b3f629), as 32-bit arrays with a description, ``dm97.json``. The slopes
-have no tip and tilt; the largest mask reaches beyond the 29 x 29 lenslets of the camera.
+From the repository rjonnal/ciao3 (commit 62b3f629), as 32-bit arrays with a description, ``dm97.json``. The
+slopes have no tip and tilt; the largest mask reaches beyond the 29 x 29 lenslets of the camera.
 """
 
 from __future__ import annotations
