@@ -35,7 +35,7 @@ def remaining(measured: NDArray[np.float64], predicted: NDArray[np.float64]) -> 
 
 
 def loop_eigenvalues(measured: NDArray[np.float64], predicted: NDArray[np.float64]) -> tuple[float, float]:
-    """Smallest and largest real part of the eigenvalues of ``R D`` over the best-seen modes of the prediction."""
+    """Smallest and largest real part of the eigenvalues of ``R D`` over the best-seen modes."""
     u, s, vt = np.linalg.svd(predicted, full_matrices=False)
     u, s, vt = u[:, :_N_MODES], s[:_N_MODES], vt[:_N_MODES]
     values = np.linalg.eigvals((u.T @ measured @ vt.T) / s[:, None]).real
@@ -64,8 +64,9 @@ def compare(
 def describe(line: dict[str, Any]) -> str:
     """One line for the terminal."""
     verdict = "converged" if line["converged"] else line["warnings"][0]
-    text = f"{line['date']}: {verdict}, {np.round(line['registration'], 2).tolist()}, leaves
-    {line['leaves']:.3f}" if "moved" in line:
+    registration = np.round(line["registration"], 2).tolist()
+    text = f"{line['date']}: {verdict}, {registration}, leaves {line['leaves']:.3f}"
+    if "moved" in line:
         text += f"; earlier measured matrix {line['measured_leaves']:.3f}"
         text += f", synthetic {line['synthetic_leaves']:.3f}, at this registration {line['moved_leaves']:.3f}"
         text += f", eigenvalues {line['eigenvalues'][0]:.2f} to {line['eigenvalues'][1]:.2f}"

@@ -1,1 +1,1 @@
-"""Real calibration data: readers of the folders described in their ``README.md``, which the project does not contain."""
+"""Real calibration data: readers of folders that are next to the project, with their ``README.md``."""
