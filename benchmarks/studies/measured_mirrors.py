@@ -36,7 +36,8 @@ def remaining(measured: NDArray[np.float64], predicted: NDArray[np.float64]) -> 
 
 def loop_eigenvalues(measured: NDArray[np.float64], predicted: NDArray[np.float64]) -> tuple[float, float]:
     """Smallest and largest real part of the eigenvalues of ``R D`` over the best-seen modes."""
-    u, s, vt = np.linalg.svd(predicted, full_matrices=False)
+    gain = np.vdot(predicted, measured) / np.vdot(predicted, predicted)
+    u, s, vt = np.linalg.svd(gain * predicted, full_matrices=False)
     u, s, vt = u[:, :_N_MODES], s[:_N_MODES], vt[:_N_MODES]
     values = np.linalg.eigvals((u.T @ measured @ vt.T) / s[:, None]).real
     return float(values.min()), float(values.max())

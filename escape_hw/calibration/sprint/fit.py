@@ -416,7 +416,10 @@ def check_convergence(
     sigma, gain_sigma
         Standard errors of the registration ``(5,)`` and of the gain.
     """
-    warnings = []
+    warnings = check_fit(
+        context.matrix, context.model, context.columns, weighted, solution.system.residual, solution.gain,
+        gain_sigma, Registration.from_array(solution.alpha),
+    )  # fmt: skip
     # A large misfit of the model prevents steps as small as the noise alone would allow.
     steps_converged = solution.steps_converged or (
         solution.remaining_step is not None
@@ -424,10 +427,6 @@ def check_convergence(
     )
     if not steps_converged:
         warnings.append(f"the steps did not shrink within {len(context.history)} iterations")
-    warnings += check_fit(
-        context.matrix, context.model, context.columns, weighted, solution.system.residual, solution.gain,
-        gain_sigma, Registration.from_array(solution.alpha),
-    )  # fmt: skip
     worst = int(np.argmax(sigma / MAX_STEP))
     if sigma[worst] > MAX_STEP[worst]:
         warnings.append(f"the data do not constrain {PARAMETERS[worst]}; use more frames or more modes")
