@@ -97,7 +97,11 @@ def registration(scale: float = 1.0, seed: int = 3) -> RegistrationEstimate:
         chi2=1.04,
         warnings=("tangential_scaling is consistent with zero",),
         actuator_corrections=ActuatorCorrections(
-            rng.normal(0, 0.05, 97), np.full(97, 0.004), rng.normal(0, 0.02, 97), pedestal=0.03
+            rng.normal(0, 0.05, 97),
+            np.full(97, 0.004),
+            rng.normal(0, 0.02, 97),
+            np.array([0.0, 0.0, 0.03]),
+            rng.normal(0, 2.0, (2, 97)),
         ),
     )
 

@@ -15,9 +15,6 @@ from escape_hw.api.representation import line_html, short_repr, table_html
 from escape_hw.api.sensor import SensorGeometry
 from escape_hw.deprecation import renamed_members
 
-#: Width of the broad pedestal of the influence functions, relative to their own width.
-PEDESTAL = 1.7
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ActuatorCorrections:
@@ -32,14 +29,19 @@ class ActuatorCorrections:
         Relative gain of every actuator beyond the common one, and its standard error ``(n_act,)``.
     width
         Relative width of every influence function beyond the common one ``(n_act,)``.
-    pedestal
-        Share of the broad pedestal in all influence functions.
+    shape
+        Coefficients of the common shape of the influence functions
+        (:class:`~escape_hw.calibration.sprint.influence_shape.InfluenceShape`).
+    position
+        Position of every actuator along x and y beyond the nominal one, in % of a sub-aperture ``(2,
+        n_act)``.
     """
 
     gain: NDArray[np.float64]
     gain_sigma: NDArray[np.float64]
     width: NDArray[np.float64]
-    pedestal: float
+    shape: NDArray[np.float64]
+    position: NDArray[np.float64]
     __repr__ = short_repr
 
 

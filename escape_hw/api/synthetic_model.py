@@ -67,6 +67,16 @@ class SyntheticModel(Protocol):
 
 
 @runtime_checkable
+class HasActuatorPositions(Protocol):
+    """A model that knows where the actuators are."""
+
+    @property
+    def actuator_positions_m(self) -> NDArray[np.float64]:
+        """Nominal positions of the actuators ``(n_act, 2)`` as (x, y) on the pupil in metres."""
+        ...
+
+
+@runtime_checkable
 class HasSystematicError(Protocol):
     """A model with a systematic error of the origin of its registration."""
 

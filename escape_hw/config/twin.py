@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Self
+from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -178,8 +178,15 @@ class TwinRegistration(Section):
 
 
 class TwinMirror(Section):
-    """Deviations of the mirror from its data sheet."""
+    """Deviations of the mirror from its data sheet.
 
+    The shape ``exponential`` is drawn from ``system.seed``, as measured ALPAO mirrors are: rounding,
+    four-fold term, positions and edge actuators, and the length unless ``coupling`` sets it.
+    """
+
+    shape: Literal["gaussian", "exponential", "thin-plate", "file"] = Field(
+        "gaussian", description="true influence functions: gaussian, exponential, thin-plate, or file"
+    )
     gain_scatter: float = Field(0.0, ge=0, le=0.5, description="scatter of the actuator gains, rms fraction")
     coupling: float | None = Field(
         None, ge=0.01, le=0.9, description="true coupling, fraction; absent: as devices.dm.coupling"
@@ -191,7 +198,7 @@ class TwinMirror(Section):
         0.0, ge=0, le=0.5, description="fraction of each influence function in wings wider than its core"
     )
     influence_file: str = Field(
-        "", description="FITS file of measured influence functions (n_act, n, n); empty: Gaussians"
+        "", description="FITS file of measured influence functions (n_act, n, n), for the shape file"
     )
     influence_pixel_m: float | None = Field(
         None, gt=0, le=10, description="pixel size of influence_file on the pupil, metres; needed with a file"
@@ -202,10 +209,22 @@ class TwinMirror(Section):
     creep_fraction: float = Field(0.0, ge=0, le=0.5, description="fraction of a step that creeps")
     creep_time_s: float = Field(30.0, gt=0, le=1e5, description="time constant of the creep, seconds")
 
+    @property
+    def true_shape(self) -> str:
+        """The shape; ``file`` wherever a file is given."""
+        return "file" if self.influence_file else self.shape
+
     @model_validator(mode="after")
     def _rules(self) -> Self:
+        violations = []
         if self.influence_file and self.influence_pixel_m is None:
-            raise_violations([RuleViolation("influence_pixel_m", "", "is required with influence_file")])
+            violations.append(RuleViolation("influence_pixel_m", "", "is required with influence_file"))
+        if self.shape == "file" and not self.influence_file:
+            violations.append(RuleViolation("influence_file", "", "is required with shape = 'file'"))
+        if self.wing_fraction and self.true_shape != "gaussian":
+            text = f"belongs to shape = 'gaussian', not to '{self.true_shape}'"
+            violations.append(RuleViolation("wing_fraction", self.wing_fraction, text))
+        raise_violations(violations)
         return self
 
 

@@ -12,7 +12,6 @@ import small_system
 
 from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.registration import Registration
-from escape_hw.api.results import PEDESTAL
 from escape_hw.api.synthetic_model import SyntheticModel
 from escape_hw.calibration.modes.bases import build_basis
 from escape_hw.calibration.sprint.fit import sprint
@@ -27,6 +26,8 @@ from escape_sim.models.shack_hartmann import nominal_grid
 
 INJECTED = Registration(-16.0, 31.0, -0.77, 1.9, 0.5)
 SEEDS = range(4)
+#: Width of the broad part of the injected influence functions, relative to their own.
+BROAD = 1.7
 
 
 @dataclass(frozen=True)
@@ -62,7 +63,7 @@ def injected(design: Design, seed: int, pedestal: float = 0.02) -> np.ndarray:
     model, rng = design.model, np.random.default_rng(seed)
     gains, widths = rng.normal(1, 0.05, model.n_act), rng.normal(1.04, 0.03, model.n_act)
     zonal = np.stack([model.zonal_matrix(INJECTED, w)[:, a] for a, w in enumerate(widths)], axis=1)
-    broad = np.stack([model.zonal_matrix(INJECTED, PEDESTAL * w)[:, a] for a, w in enumerate(widths)], axis=1)
+    broad = np.stack([model.zonal_matrix(INJECTED, BROAD * w)[:, a] for a, w in enumerate(widths)], axis=1)
     return np.asarray(((1 - pedestal) * zonal + pedestal * broad) * gains)
 
 

@@ -58,7 +58,8 @@ def errors(selective: bool, solver: Solver = "mixed-effects") -> NDArray[np.floa
             "small", "push-pull", True,
         )  # fmt: skip
         found = sprint(matrix, Selective(model, trust) if selective else model, solver=solver)
-        assert found.converged
+        # With all slopes the solvers without random effects state that the model does not fit.
+        assert found.converged or not selective
         out.append(found.registration.to_array() - truth.to_array())
     return np.array(out)
 

@@ -14,7 +14,7 @@ from escape_hw.config.loader import load_system
 from escape_sim.models.factory import make_fast_model
 from escape_sim.models.shack_hartmann import nominal_grid
 
-N_COMMON, N_SLOPES, N_ACT, N_MODES, N_LINES, N_TRENDS = 7, 10, 5, 4, 3, 2
+N_COMMON, N_SLOPES, N_ACT, N_MODES, N_LINES, N_TRENDS, N_KINDS = 7, 10, 5, 4, 3, 2, 3
 
 
 #: 12 x 12 lenslets and 37 actuators.
@@ -27,11 +27,10 @@ SMALL = (
 @pytest.fixture(scope="module")
 def case():
     rng = np.random.default_rng(0)
-    n = N_COMMON + N_LINES + N_TRENDS + 2 * N_ACT + N_SLOPES
+    n = N_COMMON + N_LINES + N_TRENDS + N_KINDS * N_ACT + N_SLOPES
     return {
         "common": rng.standard_normal((N_COMMON, N_SLOPES, N_MODES)),
-        "gain_derivative": rng.standard_normal((N_SLOPES, N_ACT)),
-        "width_derivative": rng.standard_normal((N_SLOPES, N_ACT)),
+        "actuator_derivatives": rng.standard_normal((N_KINDS, N_SLOPES, N_ACT)),
         "modes": rng.standard_normal((N_ACT, N_MODES)),
         "model": rng.standard_normal((N_SLOPES, N_MODES)),
         "residual": rng.standard_normal((N_SLOPES, N_MODES)),
@@ -48,11 +47,7 @@ def jacobian(c):
     rows = list(c["common"])
     rows += [np.where((c["lines"] == k)[:, None], c["sampling_derivative"], 0.0) for k in range(N_LINES)]
     rows += [trend[:, None] * c["model"] for trend in c["trends"].T]
-    rows += [
-        np.outer(z[:, a], c["modes"][a])
-        for z in (c["gain_derivative"], c["width_derivative"])
-        for a in range(N_ACT)
-    ]
+    rows += [np.outer(z[:, a], c["modes"][a]) for z in c["actuator_derivatives"] for a in range(N_ACT)]
     rows += [np.where((np.arange(N_SLOPES) == s)[:, None], c["model"], 0.0) for s in range(N_SLOPES)]
     return np.stack(rows)
 

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from escape_hw.calibration.sprint.covariance import (
-    MODEL_ERROR_FLOOR,
     _proximity,
     _sum_by_proximity,
     sandwich_covariance,
@@ -68,10 +67,10 @@ def test_stated_errors_are_those_of_fits_to_noise_that_neighbours_share(missed):
         left = data - np.tensordot(found, derivatives, 1)
         errors.append(found)
         stated.append(np.diag(sandwich_covariance(weighted, Linear(derivatives, left), noise)))
-    floor = np.concatenate([[0.0], np.square(MODEL_ERROR_FLOOR)])
-    ratio = (np.mean(stated, axis=0) - floor) / np.mean(np.square(errors), axis=0)
+    ratio = np.mean(stated, axis=0) / np.mean(np.square(errors), axis=0)
     assert (ratio > 0.8).all(), ratio
-    assert (ratio < 1.6).all(), ratio
+    # What leaving out actuators adds is never negative.
+    assert (ratio < 1.8).all(), ratio
 
 
 def fitted(seed):

@@ -7,17 +7,16 @@ import pytest
 
 from escape_hw.calibration.sprint.normal_equations import normal_equations
 
-N_COMMON, N_SLOPES, N_ACT, N_MODES = 7, 11, 6, 5
+N_COMMON, N_SLOPES, N_ACT, N_MODES, N_KINDS = 7, 11, 6, 5, 3
 
 
 @pytest.fixture(scope="module", params=(0, 2), ids=("even", "trends"))
 def case(request):
     rng, n_trends = np.random.default_rng(0), request.param
-    n = N_COMMON + n_trends + 2 * N_ACT + N_SLOPES
+    n = N_COMMON + n_trends + N_KINDS * N_ACT + N_SLOPES
     return {
         "common": rng.standard_normal((N_COMMON, N_SLOPES, N_MODES)),
-        "gain_derivative": rng.standard_normal((N_SLOPES, N_ACT)),
-        "width_derivative": rng.standard_normal((N_SLOPES, N_ACT)),
+        "actuator_derivatives": rng.standard_normal((N_KINDS, N_SLOPES, N_ACT)),
         "modes": rng.standard_normal((N_ACT, N_MODES)),
         "model": rng.standard_normal((N_SLOPES, N_MODES)),
         "residual": rng.standard_normal((N_SLOPES, N_MODES)),
@@ -31,7 +30,7 @@ def jacobian(c):
     """Derivatives of the matrix by every unknown ``(n_slopes * n_modes, n_unknowns)``."""
     columns = list(c["common"])
     columns += [trend[:, None] * c["model"] for trend in c["trends"].T]
-    for zonal in (c["gain_derivative"], c["width_derivative"]):
+    for zonal in c["actuator_derivatives"]:
         columns += [np.outer(zonal[:, a], c["modes"][a]) for a in range(N_ACT)]
     for s in range(N_SLOPES):
         one = np.zeros((N_SLOPES, N_MODES))
@@ -86,7 +85,7 @@ def test_without_priors_they_are_orthogonal_to_every_random_effect(case):
     vague["common"] = rng.standard_normal((N_COMMON, N_SLOPES, 40))
     left = normal_equations(**vague).projected_jacobian()
     for a in range(N_ACT):
-        for zonal in (vague["gain_derivative"], vague["width_derivative"]):
+        for zonal in vague["actuator_derivatives"]:
             effect = np.outer(zonal[:, a], vague["modes"][a])
             assert np.einsum("psm,sm->p", left, effect) == pytest.approx(np.zeros(N_COMMON), abs=1e-6)
     for trend in vague["trends"].T:
@@ -116,12 +115,11 @@ def test_noise_that_slopes_share_does_not_average_out(together, want):
     alike = np.ones((n_slopes, N_ACT))
     system = normal_equations(
         rng.standard_normal((N_COMMON, n_slopes, n_modes)),
-        alike,
-        alike,
+        np.stack([alike] * N_KINDS),
         rng.standard_normal((N_ACT, n_modes)),
         rng.standard_normal((n_slopes, n_modes)),
         np.sqrt(together) * common + np.sqrt(1 - together) * own,
-        np.ones(N_COMMON + 2 * N_ACT + n_slopes),
-        np.zeros(N_COMMON + 2 * N_ACT + n_slopes),
+        np.ones(N_COMMON + N_KINDS * N_ACT + n_slopes),
+        np.zeros(N_COMMON + N_KINDS * N_ACT + n_slopes),
     )
     assert system.estimate_noise_inflation() == pytest.approx(want, rel=0.1)

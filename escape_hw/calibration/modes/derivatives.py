@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from escape_hw.api.registration import Registration
-from escape_hw.api.results import PEDESTAL
 from escape_hw.api.synthetic_model import DifferentiableModel, SyntheticModel
 
 #: Half steps of the central differences: registration in its units, relative width of the influence
@@ -56,30 +55,6 @@ def zonal_jacobian(
     if isinstance(model, DifferentiableModel):
         return model.zonal_jacobian(registration, width)
     return _central_differences(model.zonal_matrix, registration, width)
-
-
-def pedestal_jacobian(
-    model: SyntheticModel,
-    registration: Registration,
-    width: float = 1.0,
-    m2c: NDArray[np.float64] | None = None,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Slopes of the broad pedestal of the influence functions, and their derivatives.
-
-    ``width``: scale of the influence functions' width; that of the pedestal is a fixed multiple of it;
-    ``m2c``: modes ``(n_act, n_modes)``; single actuators by default.
-
-    Returns
-    -------
-    matrix : ndarray, ``(n_slopes, n_modes)``
-    derivatives : ndarray, ``(6, n_slopes, n_modes)``
-        By the five parameters of the registration, in their units, and by ``width``.
-    """
-    if m2c is None:
-        broad, derivatives = zonal_jacobian(model, registration, PEDESTAL * width)
-    else:
-        broad, derivatives = modal_jacobian(model, registration, m2c, PEDESTAL * width)
-    return broad, np.concatenate([derivatives[:5], PEDESTAL * derivatives[5:]])
 
 
 def _central_differences(

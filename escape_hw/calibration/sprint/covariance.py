@@ -68,10 +68,8 @@ class LowRankNoise:
         return np.asarray(np.eye(len(self.patterns)) / self.level + correction @ self.patterns.T)
 
 
-#: Systematic error of the registration due to errors of the synthetic model common to the whole pupil, in the
-#: units of the parameters: rms over the development realisations of a twin with all imperfections, at
-#: negligible noise (docs/decisions).
-MODEL_ERROR_FLOOR = np.array([0.03, 0.03, 0.0, 0.045, 0.018])
+#: Groups of actuators that are left out in turn.
+_N_GROUPS = 20
 
 
 def systematic_error(model: SyntheticModel) -> NDArray[np.float64]:
@@ -135,6 +133,40 @@ def _positive_part(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray((directions * np.maximum(values, 0.0)) @ directions.T)
 
 
+def _resampled_covariance(
+    total: NDArray[np.float64],
+    scores: NDArray[np.float64],
+    residual: NDArray[np.float64],
+    modes: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Covariance of the common parameters from leaving out groups of actuators in turn ``(n, n)``.
+
+    The delete-group jackknife (Shao & Tu 1995, section 2.3) of the linearised solution. The score of an
+    actuator follows from the derivative of its column, ``J M^+``, and the residual that its commands cause,
+    ``r M^T``.
+
+    Parameters
+    ----------
+    total
+        Information on the parameters, priors included ``(n, n)``.
+    scores
+        Projected derivatives ``(n, n_slopes, n_modes)``.
+    residual, modes
+        Residual ``(n_slopes, n_modes)`` and modes ``(n_act, n_modes)``.
+    """
+    inverse = np.linalg.pinv(modes)
+    zonal, commanded = scores @ inverse, scores @ modes.T
+    by_actuator = np.einsum("psa,sa->pa", zonal, residual @ modes.T)
+    groups = np.array_split(np.arange(len(modes)), min(_N_GROUPS, len(modes)))
+    information = np.einsum("psa,qsa->pqa", zonal, commanded, optimize=True)
+    steps = []
+    for group in groups:
+        part = information[:, :, group].sum(axis=2)
+        steps.append(np.linalg.solve(total - (part + part.T) / 2, by_actuator[:, group].sum(axis=1)))
+    deviations = np.array(steps) - np.mean(steps, axis=0)
+    return np.asarray(deviations.T @ deviations * (len(groups) - 1) / len(groups))
+
+
 def sandwich_covariance(
     weighted: WeightedMatrix, system: LinearisedProblem, noise: NDArray[np.float64] | None
 ) -> NDArray[np.float64]:
@@ -147,8 +179,8 @@ def sandwich_covariance(
     only their excess over the noise is added, because the scores at a solution sum to zero and the window
     alone would underestimate the noise. Without a covariance of the noise the window is used for both, plus
     the scatter of the scores from mode to mode, which contains errors common to all slopes during the
-    measurement of a mode. Errors common to the whole pupil appear in no scatter; :data:`MODEL_ERROR_FLOOR`
-    accounts for them.
+    measurement of a mode. What differences between the actuators can do to the parameters beyond that is
+    estimated by leaving out groups of them (:func:`_resampled_covariance`).
 
     Parameters
     ----------
@@ -179,5 +211,5 @@ def sandwich_covariance(
     # Not smaller than the errors due to noise alone.
     scale = np.sqrt(np.maximum(power * np.diag(bread) / np.diag(estimate), 1.0))
     covariance = estimate * np.outer(scale, scale)
-    covariance[np.arange(1, 6), np.arange(1, 6)] += np.square(MODEL_ERROR_FLOOR)
-    return np.asarray(covariance)
+    resampled = _resampled_covariance(system.information(), scores, system.residual, weighted.modes)
+    return np.asarray(covariance + _positive_part(resampled - covariance))

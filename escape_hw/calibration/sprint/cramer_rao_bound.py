@@ -16,7 +16,7 @@ from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.registration import Registration
 from escape_hw.api.synthetic_model import SyntheticModel
 from escape_hw.calibration.modes.derivatives import modal_matrix
-from escape_hw.calibration.sprint.covariance import MODEL_ERROR_FLOOR, LowRankNoise
+from escape_hw.calibration.sprint.covariance import LowRankNoise
 from escape_hw.calibration.sprint.mixed_effects import MixedEffectsProblem
 from escape_hw.calibration.sprint.normal_equations import NormalEquations, Priors
 from escape_hw.calibration.sprint.telemetry_fit import decorrelate_columns
@@ -82,9 +82,7 @@ def compute_registration_bound(
     else:
         information_matrix, hybrid = system.inner, np.linalg.inv(system.information())
     exact = np.linalg.inv(information_matrix[:6, :6])
-    return CramerRaoBound(
-        np.sqrt(np.diag(exact)[1:6]), np.sqrt(np.diag(hybrid)[1:6] + np.square(MODEL_ERROR_FLOOR))
-    )
+    return CramerRaoBound(np.sqrt(np.diag(exact)[1:6]), np.sqrt(np.diag(hybrid)[1:6]))
 
 
 def correlated_information(
@@ -107,21 +105,22 @@ def correlated_information(
     common, sampling_derivative = system.common, system.sampling_derivative
     model, modes, k = system.model, system.modes, len(system.common)
     member = (system.lines[:, None] == np.arange(system.lines.max() + 1)).astype(float)
-    zonal = np.concatenate([system.gain_derivative, system.width_derivative], axis=1)
-    modes_twice = np.concatenate([modes, modes])
+    zonal = np.concatenate(system.actuator_derivatives, axis=1)
+    n_kinds = len(system.actuator_derivatives)
+    repeated_modes = np.tile(modes, (n_kinds, 1))
     metric_common = np.einsum("st,ptm->psm", metric, common, optimize=True)
     metric_zonal = metric @ zonal
     flat = common.reshape(k, -1)
-    common_acting = (np.concatenate([metric_common @ modes.T] * 2, axis=2) * zonal).sum(axis=1)
+    common_acting = (np.concatenate([metric_common @ modes.T] * n_kinds, axis=2) * zonal).sum(axis=1)
     by_line, by_slope = (
         np.einsum("psm,sm->ps", metric_common, part, optimize=True) for part in (sampling_derivative, model)
     )
     line_acting, slope_acting = (
-        (part @ modes_twice.T) * metric_zonal for part in (sampling_derivative, model)
+        (part @ repeated_modes.T) * metric_zonal for part in (sampling_derivative, model)
     )
     line_line = member.T @ (metric * (sampling_derivative @ sampling_derivative.T)) @ member
     slope_line = (metric * (model @ sampling_derivative.T)) @ member
-    acting = (zonal.T @ metric_zonal) * (modes_twice @ modes_twice.T)
+    acting = (zonal.T @ metric_zonal) * (repeated_modes @ repeated_modes.T)
     slope_slope = metric * (model @ model.T)
     # A trend is a linear combination of slope gains.
     trends, line_trend = system.trends, slope_line.T @ system.trends

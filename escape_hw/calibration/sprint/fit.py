@@ -20,14 +20,15 @@ from escape_hw.api.registration import PARAMETERS, Registration
 from escape_hw.api.results import Estimate, RegistrationEstimate
 from escape_hw.api.synthetic_model import SyntheticModel
 from escape_hw.calibration.modes.derivatives import modal_matrix
-from escape_hw.calibration.sprint.coarse_search import MIN_EXPLAINED_FRACTION
-from escape_hw.calibration.sprint.covariance import MODEL_ERROR_FLOOR, sandwich_covariance, systematic_error
-from escape_hw.calibration.sprint.diagnostics import check_orientation, describe_degeneracies
+from escape_hw.calibration.sprint.covariance import sandwich_covariance, systematic_error
+from escape_hw.calibration.sprint.diagnostics import describe_degeneracies
 from escape_hw.calibration.sprint.extra_parameters import build_extra_parameters
+from escape_hw.calibration.sprint.goodness_of_fit import check_fit
 from escape_hw.calibration.sprint.mixed_effects import GAIN, WIDTH, PriorEstimate
 from escape_hw.calibration.sprint.mode_choice import choose_modes
 from escape_hw.calibration.sprint.normal_equations import Priors
 from escape_hw.calibration.sprint.solvers import MAX_STEP, SolverContext, SprintSolution, solve
+from escape_hw.calibration.sprint.tip_tilt import TipTiltFreeModel, is_tip_tilt_removed
 from escape_hw.calibration.sprint.weighted_matrix import (
     HUBER_ITERATIONS,
     WeightedMatrix,
@@ -53,7 +54,7 @@ from escape_hw.errors import CalibrationError, ConfigError, IncompatibleProduct
 T = TypeVar("T")
 
 #: The common parameters, in their order; shares of the model's variants follow.
-_PARAMETER_NAMES = ("gain", *PARAMETERS, "width", "pedestal")
+_PARAMETER_NAMES = ("gain", *PARAMETERS, "width")
 #: Remaining step, relative to the stated errors, below which the descent counts as converged.
 _NEGLIGIBLE_STEP = 0.05
 #: Optional attributes of a model in version 0.1.0 -> present names.
@@ -61,6 +62,7 @@ _RENAMED_CAPABILITIES = {
     "registration_doubt": "registration_systematic_error",
     "slope_trust": "slope_weights",
 }
+_TIP_TILT_NOTE = "the slopes of the matrix have no tip and tilt; those of the model were removed as well"
 #: Signal-to-noise ratio of the best mode below which a matrix is refused.
 _MIN_SNR = 0.1
 
@@ -125,7 +127,7 @@ def sprint(
     max_iterations: int = 25,
     covariance: NDArray[np.float64] | None = None,
     priors: Priors | None = None,
-    update_priors: bool = False,
+    update_priors: bool = True,
     coarse_search: bool = True,
     extra_parameters: Sequence[ExtraParameter] = (),
     actuator_model: ActuatorModel = "fitted",
@@ -165,7 +167,7 @@ def sprint(
     priors
         Prior scatter of the random effects.
     update_priors
-        Estimate that scatter from the data and solve again with it; useful with few frames.
+        Estimate that scatter from the data and solve again with it.
     coarse_search
         Search from far away first, low modes before high ones (:mod:`~.coarse_search`). Without it the
         descent starts at ``start`` with all modes.
@@ -221,7 +223,7 @@ def fit_registration(
     max_iterations: int = 25,
     covariance: NDArray[np.float64] | None = None,
     priors: Priors | None = None,
-    update_priors: bool = False,
+    update_priors: bool = True,
     coarse_search: bool = True,
     extra_parameters: Sequence[ExtraParameter] = (),
     actuator_model: ActuatorModel = "fitted",
@@ -241,6 +243,9 @@ def fit_registration(
             "needs solver = 'mixed-effects'"
         )
     initial = start or Registration()
+    notes: tuple[str, ...] = ()
+    if is_tip_tilt_removed(matrix):
+        model, notes = TipTiltFreeModel(model), (_TIP_TILT_NOTE,)
     with limit_to_one_thread():
         columns = _select_columns(matrix, model, modes, modes_choice, initial)
         _require_fittable(matrix, model, columns)
@@ -254,6 +259,7 @@ def fit_registration(
     )
     with limit_to_one_thread():
         estimate = _build_estimate(context, weighted, solution, covariance)
+        estimate = replace(estimate, notes=(*notes, *estimate.notes))
         if actuator_model == "fitted" and solution.actuator_corrections is not None:
             estimate = replace(estimate, actuator_corrections=solution.actuator_corrections())
     yield context.progress(estimate.sigma)
@@ -376,7 +382,7 @@ def _build_estimate(
     model_sigma = systematic_error(context.model)
     covariance[np.arange(1, 6), np.arange(1, 6)] += np.square(model_sigma)
     sigma = np.sqrt(np.diag(covariance))
-    warnings = check_convergence(context, weighted, solution, sigma[1:6])
+    warnings = check_convergence(context, weighted, solution, sigma[1:6], float(sigma[GAIN]))
     return RegistrationEstimate(
         Registration.from_array(solution.alpha),
         covariance[1:6, 1:6],
@@ -387,29 +393,33 @@ def _build_estimate(
         float(np.mean(np.square(solution.system.residual))),
         warnings,
         notes,
-        extras={
-            one.model.name: one.to_estimate(sigma, np.hypot(MODEL_ERROR_FLOOR, model_sigma))
-            for one in solution.extras
-        },
+        extras={one.model.name: one.to_estimate(sigma, model_sigma) for one in solution.extras},
     )
 
 
 def check_convergence(
-    context: SolverContext, weighted: WeightedMatrix, solution: SprintSolution, sigma: NDArray[np.float64]
+    context: SolverContext,
+    weighted: WeightedMatrix,
+    solution: SprintSolution,
+    sigma: NDArray[np.float64],
+    gain_sigma: float,
 ) -> tuple[str, ...]:
     """Reasons not to use a solution; none if SPRINT has converged.
 
-    It has converged when the steps became small, the model explains the matrix with a positive gain, and
-    the data constrain every parameter.
+    It has converged when the steps became small, the model fits (:mod:`~.goodness_of_fit`), and the data
+    constrain every parameter.
 
     Parameters
     ----------
     context, weighted, solution
         The problem and its solution.
-    sigma
-        Standard errors of the registration ``(5,)``.
+    sigma, gain_sigma
+        Standard errors of the registration ``(5,)`` and of the gain.
     """
-    warnings = []
+    warnings = check_fit(
+        context.matrix, context.model, context.columns, weighted, solution.system.residual, solution.gain,
+        gain_sigma, Registration.from_array(solution.alpha),
+    )  # fmt: skip
     # A large misfit of the model prevents steps as small as the noise alone would allow.
     steps_converged = solution.steps_converged or (
         solution.remaining_step is not None
@@ -417,19 +427,6 @@ def check_convergence(
     )
     if not steps_converged:
         warnings.append(f"the steps did not shrink within {len(context.history)} iterations")
-    residual = solution.system.residual
-    explained, signal = weighted.explained_fraction(residual), weighted.signal_fraction
-    if explained < MIN_EXPLAINED_FRACTION * signal or np.vdot(weighted.data - residual, weighted.data) <= 0:
-        hint = check_orientation(context.matrix, context.model, context.columns)
-        warnings.append(
-            f"the model explains {max(explained, 0.0):.0%} of the matrix where noise leaves {signal:.0%} "
-            f"to explain; {hint or 'wrong layout, flip or basis, or a registration beyond capture'}"
-        )
-    elif solution.gain < 0:
-        warnings.append(
-            "the gain is negative: the mirror pulls where the model pushes; check its polarity, "
-            "or whether the camera is turned by 180 degrees"
-        )
     worst = int(np.argmax(sigma / MAX_STEP))
     if sigma[worst] > MAX_STEP[worst]:
         warnings.append(f"the data do not constrain {PARAMETERS[worst]}; use more frames or more modes")

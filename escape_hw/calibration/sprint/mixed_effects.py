@@ -13,10 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from escape_hw.api.registration import Registration
-from escape_hw.api.results import PEDESTAL, ActuatorCorrections
+from escape_hw.api.results import ActuatorCorrections
 from escape_hw.api.synthetic_model import HasGainTrend, SyntheticModel
-from escape_hw.calibration.modes.derivatives import modal_matrix, pedestal_jacobian, zonal_jacobian
+from escape_hw.calibration.modes.derivatives import modal_matrix, zonal_jacobian
 from escape_hw.calibration.sprint.extra_parameters import ExtraParameterModel, FittedExtraParameter
+from escape_hw.calibration.sprint.influence_shape import InfluenceShape
 from escape_hw.calibration.sprint.normal_equations import NormalEquations, Priors, normal_equations
 from escape_hw.calibration.sprint.weighted_matrix import WeightedMatrix
 
@@ -24,16 +25,15 @@ from escape_hw.calibration.sprint.weighted_matrix import WeightedMatrix
 GAIN, WIDTH, SHAPE = 0, 6, 7
 #: Share of a variant below which its derivatives by the registration are taken to be the model's own.
 _SMALL_SHARE = 0.25
-#: Share of the pedestal below which its derivatives by the registration are neglected.
-_SMALL_PEDESTAL = 0.05
 #: Relative gain after a step above which the step of the shares is scaled to keep gain times share linear.
 _MIN_GAIN_RATIO = 0.05
-#: Groups of random effects, in the order of the unknowns ...
-_EFFECTS = ("sampling", "actuator_gain", "actuator_width", "slope_gain")
-#: ... and limits of their estimated scatter relative to the default priors.
-_MIN_PRIOR_RATIO, _MAX_PRIOR_RATIO = 0.05, 1.0
-#: Iterations of the empirical-Bayes fixed point; later ones change the scatter by less than a percent.
-_ITERATIONS = 20
+#: Effects of single actuators, in the order of the unknowns, and the priors of their scatter.
+_ACTUATOR_PRIORS = ("actuator_gain", "actuator_width", "actuator_position", "actuator_position")
+N_ACTUATOR_EFFECTS = len(_ACTUATOR_PRIORS)
+#: Limits of the estimated scatter relative to the default priors.
+_MIN_PRIOR_RATIO, _MAX_PRIOR_RATIO = 0.05, 3.0
+#: Iterations of the empirical-Bayes fixed point, and relative change of all scatters that ends them.
+_ITERATIONS, _NEGLIGIBLE_CHANGE = 20, 0.02
 #: Zero effects that are added to the count of each group: the scatter of a few effects may be chance, and
 #: omitting a real effect costs less than inventing one.
 _PSEUDO_COUNT = 2.0
@@ -54,22 +54,26 @@ class MixedEffectsState:
     gain: float
     alpha: NDArray[np.float64]
     width: float
-    shape: float
+    shape: NDArray[np.float64]
     variant: NDArray[np.float64]
     sampling: NDArray[np.float64]
     trend: NDArray[np.float64]
-    actuator_gain: NDArray[np.float64]
-    actuator_width: NDArray[np.float64]
+    actuator: NDArray[np.float64]
     slope_gain: NDArray[np.float64]
+
+    @property
+    def actuator_gain(self) -> NDArray[np.float64]:
+        """Relative gain of every actuator beyond the common one ``(n_act,)``."""
+        return np.asarray(self.actuator[0])
 
 
 @dataclass(slots=True, eq=False)
 class _ZonalMatrices:
-    """Zonal matrices at a state, in standard errors: derivatives, variants, and their sum."""
+    """Zonal matrices at a state, in standard errors: derivatives, terms, variants, and their sum."""
 
     jacobian: NDArray[np.float64]
     by_width: NDArray[np.float64]
-    by_shape: NDArray[np.float64]
+    terms: list[NDArray[np.float64]]
     variants: list[NDArray[np.float64]]
     total: NDArray[np.float64]
 
@@ -105,24 +109,30 @@ class MixedEffectsProblem:
         # The x slopes of a column of sub-apertures share a sampling position, and the y slopes of a row.
         self.lines = np.unique(np.concatenate([cols, weighted.valid.shape[1] + rows]), return_inverse=True)[1]
         self.n_lines = int(self.lines.max()) + 1
+        self.shape = InfluenceShape(model)
         self.trends = slope_trends(model, weighted.valid)
         self.precision = np.concatenate([
-            np.zeros(6), [priors.width**-2, priors.shape**-2], scatters**-2,
+            np.zeros(6), [priors.width**-2], (priors.shape_scale * self.shape.prior_sigma) ** -2.0,
+            scatters**-2,
             np.full(self.n_lines, priors.sampling**-2), np.ones(self.trends.shape[1]),
-            np.full(model.n_act, priors.noise_inflation * priors.actuator_gain**-2),
-            np.full(model.n_act, priors.actuator_width**-2),
+            *(np.full(model.n_act, self._actuator_precision(name)) for name in _ACTUATOR_PRIORS),
             np.full(weighted.data.shape[0], priors.slope_gain**-2),
         ])  # fmt: skip
+
+    def _actuator_precision(self, name: str) -> float:
+        """Prior precision of an effect of the actuators."""
+        return float(self.priors.noise_inflation * getattr(self.priors, name) ** -2)
 
     def initial_state(self, registration: Registration) -> MixedEffectsState:
         """A registration, the gain that fits best there, and the prior means."""
         n_act, n_slopes = self.model.n_act, self.weighted.data.shape[0]
-        zeros = np.zeros(n_act)
         model = self.weighted.weigh(modal_matrix(self.model, registration, self.modes))
         gain = float(np.vdot(model, self.weighted.data) / np.vdot(model, model))
         return MixedEffectsState(
-            gain, registration.to_array(), self.priors.mean_width, 0.0, self._mean_variant.copy(),
-            np.zeros(self.n_lines), np.zeros(self.trends.shape[1]), zeros, zeros.copy(), np.zeros(n_slopes),
+            gain, registration.to_array(), self.priors.mean_width, np.zeros(self.shape.n_terms),
+            self._mean_variant.copy(),
+            np.zeros(self.n_lines), np.zeros(self.trends.shape[1]), np.zeros((N_ACTUATOR_EFFECTS, n_act)),
+            np.zeros(n_slopes),
         )  # fmt: skip
 
     def _prior_moments(self) -> NDArray[np.float64]:
@@ -135,9 +145,14 @@ class MixedEffectsProblem:
 
     def offset(self, state: MixedEffectsState) -> NDArray[np.float64]:
         """Distance of a state from the prior means, in the order of the unknowns."""
-        common = [*np.zeros(6), state.width - self.priors.mean_width, state.shape]
-        effects = state.sampling, state.trend, state.actuator_gain, state.actuator_width, state.slope_gain
+        common = [*np.zeros(6), state.width - self.priors.mean_width, *state.shape]
+        effects = state.sampling, state.trend, state.actuator.ravel(), state.slope_gain
         return np.concatenate([common, state.variant - self._mean_variant, *effects])
+
+    @property
+    def first_variant(self) -> int:
+        """Index of the first variant among the unknowns."""
+        return SHAPE + self.shape.n_terms
 
     @property
     def n_variants(self) -> int:
@@ -148,38 +163,35 @@ class MixedEffectsProblem:
         """The extra parameters at a state."""
         first = len(self.variants)
         return tuple(
-            FittedExtraParameter(one, SHAPE + 1 + first + k, float(state.variant[first + k]))
+            FittedExtraParameter(one, self.first_variant + first + k, float(state.variant[first + k]))
             for k, one in enumerate(self.extras)
         )
 
     def _zonal_matrices(self, state: MixedEffectsState) -> _ZonalMatrices:
         """The weighted zonal matrix of a state and its parts."""
         registration, w, weigh = Registration.from_array(state.alpha), 1.0 + state.width, self.weighted.weigh
-        zonal_matrix, jacobian = (weigh(part) for part in zonal_jacobian(self.model, registration, w))
-        base = jacobian
+        shaped = self.shape.linearise(registration, w, state.shape)
+        nominal, jacobian, total = weigh(shaped.nominal), weigh(shaped.jacobian), weigh(shaped.matrix)
         variants = []
         for variant, share in zip(self.variants, state.variant, strict=False):
             if abs(share) < _SMALL_SHARE:
-                variants.append(weigh(variant.zonal_matrix(registration, w)) - zonal_matrix)
+                variants.append(weigh(variant.zonal_matrix(registration, w)) - nominal)
                 continue
             # A large share changes the derivatives by the registration.
             changed, changes = (weigh(part) for part in zonal_jacobian(variant, registration, w))
-            variants.append(changed - zonal_matrix)
-            jacobian = jacobian + share * (changes - base)
-        if abs(state.shape) < _SMALL_PEDESTAL:
-            broad = weigh(self.model.zonal_matrix(registration, w * PEDESTAL))
-        else:
-            broad, changes = (weigh(part) for part in pedestal_jacobian(self.model, registration, w))
-            jacobian = jacobian + state.shape * (changes - base)
-        by_width, by_shape = jacobian[5] * w, broad - zonal_matrix
+            variants.append(changed - nominal)
+            jacobian = jacobian + share * (changes - weigh(shaped.base))
+        by_width = jacobian[5] * w
         first = len(self.variants)
         for extra, share in zip(self.extras, state.variant[first:], strict=False):
             variants.append(weigh(extra.matrix_change(registration, w, float(share))))
-        variants += [zonal_matrix @ command_curve for command_curve in self.command_curves]
-        total = zonal_matrix + state.shape * by_shape + state.actuator_width * by_width
+        variants += [nominal @ command_curve for command_curve in self.command_curves]
         for share, difference in zip(state.variant, variants, strict=True):
             total = total + share * difference
-        return _ZonalMatrices(jacobian, by_width, by_shape, variants, total)
+        _, width, along_x, along_y = state.actuator
+        total = total + width * by_width + along_x * jacobian[0] + along_y * jacobian[1]
+        terms = [weigh(term) for term in shaped.terms]
+        return _ZonalMatrices(jacobian, by_width, terms, variants, total)
 
     def matrix(self, state: MixedEffectsState, m2c: NDArray[np.float64]) -> NDArray[np.float64]:
         """Slopes per unit of modes ``m2c (n_act, n)`` at a state, random effects included."""
@@ -195,17 +207,30 @@ class MixedEffectsProblem:
             return np.asarray(rows * (zonal @ scaled_modes))
 
         unit = modal(z.total)
-        parts = (*z.jacobian, z.by_shape, *z.variants)
+        parts = (*z.jacobian, *z.terms, *z.variants)
         common = np.stack([unit, *(state.gain * modal(part) for part in parts)])
         # A sampling position acts as a shift shared by the lenslets of a column (x) or a row (y).
         half = unit.shape[0] // 2
         sampling_derivative = np.concatenate([common[1, :half], common[2, half:]])
         model = state.gain * unit + state.sampling[self.lines, None] * sampling_derivative
         return normal_equations(
-            common, state.gain * rows * z.total, state.gain * rows * z.by_width * actuator_factor, self.modes,
+            common, state.gain * rows * self._actuator_derivatives(z, actuator_factor), self.modes,
             state.gain * (z.total @ scaled_modes), self.weighted.data - model, self.precision,
             self.offset(state), sampling_derivative, self.lines, self.trends,
         )  # fmt: skip
+
+    def _actuator_derivatives(
+        self, z: _ZonalMatrices, actuator_factor: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Weighted derivatives by the effects of the actuators ``(n_effects, n_slopes, n_act)``."""
+        return np.stack(
+            [
+                z.total,
+                z.by_width * actuator_factor,
+                z.jacobian[0] * actuator_factor,
+                z.jacobian[1] * actuator_factor,
+            ]
+        )
 
     def _slope_gains(self, state: MixedEffectsState) -> NDArray[np.float64]:
         """Gain of every slope relative to the common one ``(n_slopes,)``."""
@@ -221,62 +246,68 @@ class MixedEffectsProblem:
         return np.asarray(scale[:, None] * sampled_matrix * (1 + state.actuator_gain))
 
     def estimate_priors(self, state: MixedEffectsState, system: NormalEquations) -> PriorEstimate:
-        """Estimate the scatter of the random effects from a solution.
-
-        One step of expectation and maximisation (Dempster, Laird & Rubin 1977): the most likely variance of
-        a group of effects is the mean square of their estimates plus their mean posterior variance. Where
-        the data have no information that is the prior; the scatter of an absent effect decreases from step
-        to step.
-        """
+        """Estimate the scatter of the random effects from a solution (:func:`estimate_scatters`)."""
+        groups = self._effect_groups(system)
+        usual, inner = Priors(), len(system.schur_complement)
+        bounds = {
+            name: (_MIN_PRIOR_RATIO * getattr(usual, name), _MAX_PRIOR_RATIO * getattr(usual, name))
+            for name in (*groups, "slope_gain")
+        }
+        # A misfit of the model enlarges the noise that the effects are compared with.
+        rms = float(np.sqrt(np.mean(np.square(system.residual))))
+        noise = max(rms, self.weighted.noise_level(system.residual))
+        present = np.array([getattr(self.priors, name) for name in groups])
+        ratios = estimate_scatters(
+            system.schur_complement, self.offset(state)[:inner], self.precision[:inner],
+            list(groups.values()),
+            [np.divide(bounds[name], scatter) for name, scatter in zip(groups, present, strict=True)], noise,
+        )  # fmt: skip
+        scatter = dict(zip(groups, (present * ratios).tolist(), strict=True))
+        # The slope gains were eliminated: one step of expectation and maximisation (Dempster, Laird & Rubin
+        # 1977).
         variance = system.posterior_variance()
-        head, n_act = SHAPE + 1 + self.n_variants, self.model.n_act
-        counts = (self.n_lines, self.trends.shape[1], n_act, n_act, self.weighted.data.shape[0])
-        lines, _, gains, widths, slopes = np.split(variance[head:], np.cumsum(counts)[:-1])
-        scatter, usual = {}, Priors()
-        parts = lines, self.priors.noise_inflation * gains, widths, slopes
-        for name, part in zip(_EFFECTS, parts, strict=True):
-            least = _MIN_PRIOR_RATIO * getattr(usual, name)
-            mean_square = float(np.mean(np.square(getattr(state, name)) + part))
-            scatter[name] = max(float(np.sqrt(mean_square)), least)
-        if self.trends.shape[1]:
-            scatter["noise_inflation"] = system.estimate_noise_inflation()
-        n_effective_parameters = float(np.sum(1 - variance * self.precision))
-        return PriorEstimate(replace(self.priors, **scatter), n_effective_parameters)
+        mean_square = float(np.mean(np.square(state.slope_gain) + variance[inner:]))
+        scatter["slope_gain"] = float(np.clip(np.sqrt(mean_square), *bounds["slope_gain"]))
+        inflation = system.estimate_noise_inflation() if self.trends.shape[1] else 1.0
+        priors = replace(self.priors, **scatter, noise_inflation=inflation)
+        return PriorEstimate(priors, float(np.sum(1 - variance * self.precision)))
+
+    def _effect_groups(self, system: NormalEquations) -> dict[str, NDArray[np.intp]]:
+        """Unknowns of each group of random effects, by the name of its scatter in :class:`Priors`."""
+        inner, n_act = len(system.schur_complement), self.model.n_act
+        first = inner - N_ACTUATOR_EFFECTS * n_act
+        lines = np.arange(first - self.trends.shape[1] - self.n_lines, first - self.trends.shape[1])
+        groups = {"shape_scale": np.arange(SHAPE, self.first_variant), "sampling": lines}
+        for number, name in enumerate(_ACTUATOR_PRIORS):
+            members = np.arange(first + number * n_act, first + (number + 1) * n_act)
+            groups[name] = np.concatenate([groups[name], members]) if name in groups else members
+        return groups
 
     def actuator_corrections(self, state: MixedEffectsState, system: NormalEquations) -> ActuatorCorrections:
         """Differences between the mirror of a solution and the nominal one."""
-        # The slope gains, eliminated first, come last.
         inner = len(system.schur_complement)
-        n_act = self.model.n_act
-        groups = slice(inner - 2 * n_act, inner - n_act), slice(inner - n_act, inner)
-        usual = Priors()
-        bounds = [
-            (_MIN_PRIOR_RATIO * each, _MAX_PRIOR_RATIO * each)
-            for each in (usual.actuator_gain, usual.actuator_width)
+        variance = np.diag(np.linalg.inv(system.schur_complement))[
+            inner - N_ACTUATOR_EFFECTS * self.model.n_act :
         ]
-        # A misfit of the model enlarges the noise that the effects are compared with.
-        rms = float(np.sqrt(np.mean(np.square(system.residual))))
-        value, sigma = empirical_bayes(
-            system.schur_complement, self.offset(state)[:inner], self.precision[:inner], groups, bounds,
-            max(rms, self.weighted.noise_level(system.residual)),
-        )  # fmt: skip
-        gains, widths = groups
-        return ActuatorCorrections(value[gains], sigma[gains], value[widths], state.shape)
+        noise = self.weighted.noise_level(system.residual)
+        gain_sigma = noise * np.sqrt(variance[: self.model.n_act])
+        gain, width, *position = state.actuator
+        return ActuatorCorrections(gain, gain_sigma, width, state.shape, np.array(position))
 
     def move(self, state: MixedEffectsState, step: NDArray[np.floating]) -> MixedEffectsState:
         """The state after a step, in the order of the unknowns."""
         n_act = self.model.n_act
-        counts = self.n_variants, self.n_lines, self.trends.shape[1], n_act, n_act
-        variant, sampling, trend, gains, widths, slopes = np.split(step[8:], np.cumsum(counts))
+        counts = self.n_variants, self.n_lines, self.trends.shape[1], N_ACTUATOR_EFFECTS * n_act
+        variant, sampling, trend, actuators, slopes = np.split(step[self.first_variant :], np.cumsum(counts))
         # The matrix is linear in gain times share, so the step is exact in that product.
         gain = state.gain + step[GAIN]
         gain_ratio = state.gain / gain if gain > _MIN_GAIN_RATIO * state.gain else 1.0
         return MixedEffectsState(
             gain, state.alpha + step[1:6],
             float(np.clip(state.width + step[WIDTH], -0.5, 1.0)),
-            float(np.clip(state.shape + gain_ratio * step[SHAPE], -0.5, 0.5)),
+            state.shape + gain_ratio * step[SHAPE : self.first_variant],
             state.variant + gain_ratio * variant, state.sampling + sampling, state.trend + trend,
-            state.actuator_gain + gains, state.actuator_width + widths, state.slope_gain + slopes,
+            state.actuator + actuators.reshape(-1, n_act), state.slope_gain + slopes,
         )  # fmt: skip
 
 
@@ -309,15 +340,15 @@ def slope_trends(model: SyntheticModel, valid: NDArray[np.bool_]) -> NDArray[np.
     return scatter * np.kron(np.eye(2), squares - squares.mean(axis=0))
 
 
-def empirical_bayes(
+def estimate_scatters(
     information: NDArray[np.float64],
     value: NDArray[np.float64],
     precision: NDArray[np.float64],
-    groups: Sequence[slice],
-    bounds: Sequence[tuple[float, float]],
+    groups: Sequence[NDArray[np.intp]],
+    bounds: Sequence[Sequence[float] | NDArray[np.float64]],
     noise: float = 1.0,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Posterior of random effects under the priors that maximise the evidence.
+) -> NDArray[np.float64]:
+    """Scatter of groups of random effects that maximises the evidence, relative to the present one.
 
     The variance of each group is the fixed point ``sum x^2 / sum(1 - var / scatter^2)`` (MacKay 1992, eq.
     4.9 and 4.10), with a few zero effects added to the count. Unlike a chosen prior, it goes to its lower
@@ -332,26 +363,30 @@ def empirical_bayes(
     precision
         Present prior precisions ``(n,)``.
     groups
-        Unknowns that share a scatter.
+        Indices of the unknowns that share a factor on their prior scatter.
     bounds
-        Smallest and largest scatter of each group.
+        Smallest and largest factor of each group.
     noise
         Noise of the data in the units of ``information``.
 
     Returns
     -------
-    value, sigma : ndarray, ``(n,)``
-        Posterior mean and standard error.
+    ndarray, ``(n_groups,)``
     """
-    data = (information - np.diag(precision)) / noise**2
+    # In units of the prior scatter, where there is one.
+    unit = np.where(precision > 0, np.maximum(precision, 1e-300) ** -0.5, 1.0)
+    data = (information - np.diag(precision)) * np.outer(unit, unit) / noise**2
     # The gradient vanishes at the solution.
-    right_hand_side = information @ value / noise**2
-    prior = precision.copy()
+    right_hand_side = unit * (information @ value) / noise**2
+    prior, ratios = (precision > 0).astype(float), np.ones(len(groups))
     for _ in range(_ITERATIONS):
         covariance = np.linalg.inv(data + np.diag(prior))
-        posterior_mean = covariance @ right_hand_side
-        for group, (smallest, largest) in zip(groups, bounds, strict=True):
-            n_determined = np.sum(1 - np.diag(covariance)[group] * prior[group])
-            square = np.square(posterior_mean[group]).sum() / (float(n_determined) + _PSEUDO_COUNT)
-            prior[group] = 1 / np.clip(square, smallest**2, largest**2)
-    return posterior_mean, np.sqrt(np.maximum(np.diag(covariance), 0.0))
+        posterior_mean, before = covariance @ right_hand_side, ratios.copy()
+        for number, (group, (smallest, largest)) in enumerate(zip(groups, bounds, strict=True)):
+            n_determined = float(np.sum(1 - np.diag(covariance)[group] * prior[group]))
+            square = np.square(posterior_mean[group]).sum() / (n_determined + _PSEUDO_COUNT)
+            ratios[number] = np.clip(np.sqrt(square), smallest, largest)
+            prior[group] = ratios[number] ** -2
+        if (np.abs(ratios / before - 1) < _NEGLIGIBLE_CHANGE).all():
+            break
+    return ratios

@@ -23,14 +23,19 @@ class Priors:
         Gains of single actuators.
     actuator_width
         Widths of single influence functions.
+    actuator_position
+        Positions of single actuators along each axis, in % of a sub-aperture.
     slope_gain
         Gains of single slopes: uneven light, spot size and alignment with the pixels.
     sampling
         Position within its lenslet at which a slope samples the wavefront, in % of a sub-aperture; common
         to the x slopes of a column and to the y slopes of a row, which have the same alignment with the
         pixels.
-    width, shape
-        Common width of the influence functions, and the share of a broad pedestal in them.
+    width
+        Common width of the influence functions.
+    shape_scale
+        Scatter of the coefficients of their shape, relative to that of
+        :class:`~.influence_shape.InfluenceShape`.
     mean_width
         Prior mean of the relative width beyond nominal: zero, or the value of an earlier fit.
     extras
@@ -44,9 +49,10 @@ class Priors:
 
     actuator_gain: float = 0.1
     actuator_width: float = 0.05
+    actuator_position: float = 5.0
     slope_gain: float = 0.1
     width: float = 0.2
-    shape: float = 0.2
+    shape_scale: float = 1.0
     sampling: float = 0.5
     mean_width: float = 0.0
     extras: tuple[tuple[float, float], ...] = ()
@@ -58,8 +64,8 @@ class NormalEquations:
     """Gauss-Newton system of one linearisation, in units of the data's standard errors.
 
     The unknowns are, in order: the common parameters (gain, five of the registration, width, shape,
-    shares of the model's variants), sampling positions, trends of the slope gains, actuator gains,
-    actuator widths, slope gains.
+    shares of the model's variants), sampling positions, trends of the slope gains, the effects of the
+    actuators (all of one kind, then those of the next), slope gains.
     The gain of a slope affects no other slope, so that block is diagonal and is eliminated first.
 
     Parameters
@@ -74,7 +80,7 @@ class NormalEquations:
         ``inner`` with the slope gains eliminated.
     right_hand_side
         Of the whole system.
-    common, sampling_derivative, gain_derivative, width_derivative, modes, model, residual, lines, trends
+    common, sampling_derivative, actuator_derivatives, modes, model, residual, lines, trends
         Arguments of :func:`normal_equations`.
     """
 
@@ -85,8 +91,7 @@ class NormalEquations:
     right_hand_side: NDArray[np.float64]
     common: NDArray[np.float64]
     sampling_derivative: NDArray[np.float64]
-    gain_derivative: NDArray[np.float64]
-    width_derivative: NDArray[np.float64]
+    actuator_derivatives: NDArray[np.float64]
     modes: NDArray[np.float64]
     model: NDArray[np.float64]
     residual: NDArray[np.float64]
@@ -151,16 +156,19 @@ class NormalEquations:
         -------
         ndarray, ``(n_common, n_slopes, n_modes)``
         """
-        k, n_act, n_trends = self.n_common, len(self.modes), self.trends.shape[1]
+        k, n_trends = self.n_common, self.trends.shape[1]
+        n_kinds, _, n_act = self.actuator_derivatives.shape
         schur_complement = self.schur_complement
         inner = np.linalg.solve(schur_complement[k:, k:], schur_complement[k:, :k])
         by_slope = (self.coupling[:, :k] - self.coupling[:, k:] @ inner) / self.diagonal[:, None]
-        n_lines = len(inner) - n_trends - 2 * n_act
-        ends = np.cumsum([n_lines, n_trends, n_act])
+        n_lines = len(inner) - n_trends - n_kinds * n_act
+        ends = np.cumsum([n_lines, n_trends])
         out = np.empty_like(self.common)
         for p in range(k):
-            by_line, by_trend, by_gain, by_width = np.split(inner[:, p], ends)
-            acting = (self.gain_derivative * by_gain + self.width_derivative * by_width) @ self.modes
+            by_line, by_trend, by_actuator = np.split(inner[:, p], ends)
+            acting = (self.actuator_derivatives * by_actuator.reshape(n_kinds, 1, n_act)).sum(
+                axis=0
+            ) @ self.modes
             out[p] = self.common[p] - acting - (by_slope[:, p] + self.trends @ by_trend)[:, None] * self.model
             if n_lines:
                 out[p] -= by_line[self.lines, None] * self.sampling_derivative
@@ -172,15 +180,15 @@ class NormalEquations:
         Turbulence correlates the noise of neighbouring slopes, so it does not average out over the slopes
         of an actuator. The columns have independent noise, so the factor follows from their scatter.
         """
-        observed = float(np.square(self.gain_derivative.T @ self.residual).sum())
-        independent = float(np.square(self.gain_derivative).sum()) * self.residual.shape[1]
+        gain_derivative = self.actuator_derivatives[0]
+        observed = float(np.square(gain_derivative.T @ self.residual).sum())
+        independent = float(np.square(gain_derivative).sum()) * self.residual.shape[1]
         return float(max(observed / max(independent, 1e-300), 1.0))
 
 
 def normal_equations(
     common: NDArray[np.float64],
-    gain_derivative: NDArray[np.float64],
-    width_derivative: NDArray[np.float64],
+    actuator_derivatives: NDArray[np.float64],
     modes: NDArray[np.float64],
     model: NDArray[np.float64],
     residual: NDArray[np.float64],
@@ -196,9 +204,9 @@ def normal_equations(
     ----------
     common
         Weighted derivatives by the common parameters ``(n_common, n_slopes, n_modes)``.
-    gain_derivative, width_derivative
-        Weighted zonal matrices ``(n_slopes, n_act)``: the derivative by the gain or width of an actuator is
-        the outer product of its column and its row of ``modes``.
+    actuator_derivatives
+        Weighted zonal matrices ``(n_kinds, n_slopes, n_act)``: the derivative by an effect of an actuator,
+        such as its gain (the first kind), is the outer product of its column and its row of ``modes``.
     modes
         Weighted mode-to-command matrix ``(n_act, n_modes)``.
     model, residual
@@ -221,7 +229,7 @@ def normal_equations(
     else:
         member = (lines[:, None] == np.arange(lines.max() + 1)).astype(float)
     k, n_modes = common.shape[0], model.shape[1]
-    flat, zonal = common.reshape(k, -1), (gain_derivative, width_derivative)
+    flat, zonal = common.reshape(k, -1), actuator_derivatives
     overlap = modes @ modes.T
     acting = np.block([[(a.T @ b) * overlap for b in zonal] for a in zonal])
     onto_modes = (common.reshape(-1, n_modes) @ modes.T).reshape(k, len(model), -1)
@@ -265,5 +273,5 @@ def normal_equations(
     schur_complement = inner - coupling.T @ (coupling / diagonal[:, None])
     return NormalEquations(
         inner, coupling, diagonal, schur_complement, right_hand_side - precision * offset,
-        common, sampling_derivative, gain_derivative, width_derivative, modes, model, residual, lines, trends,
+        common, sampling_derivative, actuator_derivatives, modes, model, residual, lines, trends,
     )  # fmt: skip

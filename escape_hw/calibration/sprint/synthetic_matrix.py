@@ -13,13 +13,14 @@ from numpy.typing import NDArray
 from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.pyramid import PyramidPupils
 from escape_hw.api.registration import Registration
-from escape_hw.api.results import PEDESTAL, CalibrationResult, RegistrationEstimate
+from escape_hw.api.results import CalibrationResult, RegistrationEstimate
 from escape_hw.api.sensor import SensorGeometry
 from escape_hw.api.synthetic_model import SyntheticModel
 from escape_hw.bench import Bench
 from escape_hw.calibration.acquisition.frames import build_interaction_matrix
-from escape_hw.calibration.modes.derivatives import modal_jacobian, modal_matrix, pedestal_jacobian
+from escape_hw.calibration.modes.derivatives import modal_matrix, zonal_jacobian
 from escape_hw.calibration.sprint.extra_parameters import build_fitted_extra_parameters
+from escape_hw.calibration.sprint.influence_shape import InfluenceShape
 
 
 def compute_fitted_matrix(
@@ -42,9 +43,9 @@ def compute_fitted_matrix(
     m2c
         Modes ``(n_act, n_modes)``.
     """
-    scaled_modes = _apply_actuator_gains(estimate, m2c)
-    nominal = modal_matrix(model, registration, scaled_modes, estimate.width.value)
-    return _add_corrections(nominal, model, registration, estimate, scaled_modes)
+    if estimate.actuator_corrections is None and not estimate.extras:
+        return modal_matrix(model, registration, m2c, estimate.width.value)
+    return compute_fitted_jacobian(model, replace(estimate, registration=registration), m2c)[0]
 
 
 def compute_fitted_jacobian(
@@ -67,44 +68,21 @@ def compute_fitted_jacobian(
     """
     registration, width = estimate.registration, estimate.width.value
     corrections = estimate.actuator_corrections
-    scaled_modes = _apply_actuator_gains(estimate, m2c)
-    unit, derivatives = modal_jacobian(model, registration, scaled_modes, width)
-    actuator_variance = np.zeros_like(unit)
-    if corrections is not None:
-        scaled_value, single = corrections.pedestal, model.zonal_matrix(registration, width)
-        broad = pedestal_jacobian(model, registration, width, scaled_modes)[1]
-        derivatives = derivatives + scaled_value * (broad - derivatives)
-        single = single + scaled_value * (model.zonal_matrix(registration, width * PEDESTAL) - single)
-        actuator_variance = np.square(single) @ np.square(corrections.gain_sigma[:, None] * m2c)
-    return _add_corrections(unit, model, registration, estimate, scaled_modes), derivatives, actuator_variance
-
-
-def _apply_actuator_gains(estimate: RegistrationEstimate, m2c: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Modes with the fitted gains of the actuators ``(n_act, n_modes)``."""
-    corrections = estimate.actuator_corrections
-    return m2c if corrections is None else (1 + corrections.gain)[:, None] * m2c
-
-
-def _add_corrections(
-    unit: NDArray[np.float64],
-    model: SyntheticModel,
-    registration: Registration,
-    estimate: RegistrationEstimate,
-    scaled_modes: NDArray[np.float64],
-) -> NDArray[np.float64]:
-    """Add extra parameters, and to first order the widths of the actuators and the pedestal."""
-    corrections, width = estimate.actuator_corrections, estimate.width.value
+    scaled_modes, variance = m2c, 0.0
+    if corrections is None:
+        single, jacobian = zonal_jacobian(model, registration, width)
+    else:
+        shaped = InfluenceShape(model).linearise(registration, width, corrections.shape)
+        jacobian, (along_x, along_y) = shaped.jacobian, corrections.position
+        single = shaped.matrix + width * corrections.width * jacobian[5]
+        single += along_x * jacobian[0] + along_y * jacobian[1]
+        scaled_modes = (1 + corrections.gain)[:, None] * m2c
+        variance = np.square(single) @ np.square(corrections.gain_sigma[:, None] * m2c)
     for one in build_fitted_extra_parameters(model, estimate.extras):
         scaled_value = estimate.extras[one.name].value / one.prior_sigma
-        unit = unit + scaled_value * (one.matrix_change(registration, width, scaled_value) @ scaled_modes)
-    if corrections is None:
-        return unit
-    scaled_value, wider = corrections.pedestal, corrections.width[:, None] * scaled_modes
-    broad = modal_matrix(model, registration, scaled_modes, width * PEDESTAL)
-    pedestal_change = broad - modal_matrix(model, registration, scaled_modes, width)
-    own = modal_jacobian(model, registration, wider, width)[1][5]
-    width_change = own + scaled_value * (pedestal_jacobian(model, registration, width, wider)[1][5] - own)
-    return np.asarray(unit + scaled_value * pedestal_change + width * width_change)
+        single = single + scaled_value * one.matrix_change(registration, width, scaled_value)
+    unit = single @ scaled_modes
+    return unit, jacobian @ scaled_modes, np.broadcast_to(variance, unit.shape)
 
 
 def compute_pseudo_synthetic_matrix(

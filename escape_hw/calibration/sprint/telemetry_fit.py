@@ -10,7 +10,7 @@ pokes; SPRINT fits that matrix.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,9 +44,6 @@ _OPEN_LOOP_ROUNDS = 4
 _CLOSED_LOOP_ROUNDS = 6
 #: Smallest number of whitened frames for an estimate of the noise.
 MIN_WHITENED_FRAMES = 12
-#: Systematic error of the scalings in short runs, times the number of frames, in %: from the development
-#: realisations of a twin with all imperfections, as MODEL_ERROR_FLOOR (docs/decisions).
-_SHORT_RUN_SIGMA = np.array([0.0, 0.0, 0.0, 0.8, 0.8])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -189,7 +186,8 @@ def fit_telemetry(
             iteration_options["actuator_model"] = "nominal"
         fit = yield from fit_registration(
             frames.columns(template, response.weights, matrix, variance), model, start=start,
-            covariance=covariance, priors=priors, coarse_search=start is None, **iteration_options,
+            covariance=covariance, priors=priors, update_priors=False, coarse_search=start is None,
+            **iteration_options,
         )  # fmt: skip
         start = fit.estimate.registration
         matrix = fit.zonal_matrix() @ template.m2c
@@ -198,9 +196,7 @@ def fit_telemetry(
             priors, n_effective_parameters = prior_estimate.priors, prior_estimate.n_effective_parameters
         if order:
             filters = fit_history_filters(*_residual_slopes(data, matrix, response), order)
-    estimate = fit.estimate
-    estimate = replace(estimate, covariance=estimate.covariance + np.diag(np.square(_SHORT_RUN_SIGMA / n)))
-    return TelemetryFit(estimate, response, filters[-1], covariance, n)
+    return TelemetryFit(fit.estimate, response, filters[-1], covariance, n)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -26,7 +26,6 @@ from escape_hw.calibration.sprint.covariance import sandwich_covariance, systema
 from escape_hw.calibration.sprint.extra_parameters import build_fitted_extra_parameters, priors_from_fit
 from escape_hw.calibration.sprint.mixed_effects import (
     GAIN,
-    SHAPE,
     WIDTH,
     MixedEffectsProblem,
     MixedEffectsState,
@@ -301,7 +300,7 @@ class LiveRegistration:
     ) -> SmoothedState:
         """Gain, registration and curve at the present time, without the lag of the memory."""
         first_curve = _first_curve_index(problem)
-        first_curve_index = SHAPE + 1 + first_curve
+        first_curve_index = problem.first_variant + first_curve
         selected = np.r_[0:6, first_curve_index : first_curve_index + len(self._command_curves)]
         total_covariance = sandwich_covariance(problem.weighted, system, self._sums.covariance)
         total_covariance = total_covariance[np.ix_(selected, selected)]

@@ -200,21 +200,36 @@ def pack_registration(estimate: RegistrationEstimate) -> list[Any]:
         fits_file.image_extension("COVAR", np.asarray(estimate.covariance, np.float64)),
         iterations,
         pack_metrics(notes, "ALPHANOT"),
-        *([] if estimate.actuator_corrections is None else [_pack_actuators(estimate.actuator_corrections)]),
+        *([] if estimate.actuator_corrections is None else _pack_actuators(estimate.actuator_corrections)),
     ]
 
 
-def _pack_actuators(corrections: ActuatorCorrections) -> fits.BinTableHDU:
-    columns = {"GAIN": corrections.gain, "SIGMA": corrections.gain_sigma, "WIDTH": corrections.width}
-    return fits_file.table_extension("ACTUATOR", columns, PEDESTAL=float(corrections.pedestal))
+#: Column of the share of a broad component in products of version 0.1.0, among the terms of the shape.
+_PEDESTAL_TERM = 2
+
+
+def _pack_actuators(corrections: ActuatorCorrections) -> list[fits.BinTableHDU]:
+    columns = {
+        "GAIN": corrections.gain, "SIGMA": corrections.gain_sigma, "WIDTH": corrections.width,
+        "SHIFT_X": corrections.position[0], "SHIFT_Y": corrections.position[1],
+    }  # fmt: skip
+    return [
+        fits_file.table_extension("ACTUATOR", columns),
+        fits_file.table_extension("SHAPE", {"VALUE": corrections.shape}),
+    ]
 
 
 def _unpack_actuators(hdus: fits.HDUList) -> ActuatorCorrections | None:
-    """``None`` where SPRINT did not fit actuators, and in products of earlier versions."""
+    """``None`` where SPRINT did not fit actuators."""
     if "ACTUATOR" not in hdus:
         return None
     gain, sigma, width = (_column(hdus, "ACTUATOR", name) for name in ("GAIN", "SIGMA", "WIDTH"))
-    return ActuatorCorrections(gain, sigma, width, float(hdus["ACTUATOR"].header["PEDESTAL"]))
+    if "SHAPE" not in hdus:  # version 0.1.0
+        shape = np.zeros(_PEDESTAL_TERM + 1)
+        shape[_PEDESTAL_TERM] = float(hdus["ACTUATOR"].header["PEDESTAL"])
+        return ActuatorCorrections(gain, sigma, width, shape, np.zeros((2, gain.size)))
+    position = np.stack([_column(hdus, "ACTUATOR", name) for name in ("SHIFT_X", "SHIFT_Y")])
+    return ActuatorCorrections(gain, sigma, width, _column(hdus, "SHAPE", "VALUE"), position)
 
 
 def unpack_registration(path: Path, hdus: fits.HDUList) -> RegistrationEstimate | None:

@@ -21,7 +21,9 @@ from escape_sim.mirror.influence_functions import (
     pitch_on_pupil,
     read_influence_functions,
 )
+from escape_sim.mirror.rounded_exponential import draw_exponential
 from escape_sim.mirror.surface import DriftingSurface, Flexure, InfluenceModel
+from escape_sim.mirror.thin_plate import thin_plate_surfaces
 from escape_sim.optics.base import ModulatedOptics, SensorOptics
 from escape_sim.optics.detector import Detector
 from escape_sim.optics.focal_plane import FocalPlane
@@ -283,21 +285,27 @@ class SimBench:
     # ------------------------------------------------------------------ construction
     def _make_true_influence(self, truth: np.random.Generator) -> InfluenceModel:
         mirror = self.config.twin.mirror
-        positions = actuator_positions(self.config)
-        n = len(positions)
-        if mirror.influence_file and mirror.influence_pixel_m is not None:
-            gain = 1 + mirror.gain_scatter * truth.standard_normal(n)
-            return MeasuredInfluenceFunctions(
-                read_influence_functions(mirror.influence_file, n), mirror.influence_pixel_m, gain
-            )
-        return InfluenceFunctions(
-            positions,
-            pitch_on_pupil(self.config),
-            mirror.coupling or self.config.devices.dm.coupling,
-            width=1 + mirror.width_scatter * truth.standard_normal(n),
-            gain=1 + mirror.gain_scatter * truth.standard_normal(n),
-            wing=mirror.wing_fraction,
-        )
+        positions, pitch = actuator_positions(self.config), pitch_on_pupil(self.config)
+        n, coupling = len(positions), mirror.coupling or self.config.devices.dm.coupling
+        shape = mirror.true_shape
+        if shape == "exponential":
+            return draw_exponential(
+                positions, pitch, truth, gain_scatter=mirror.gain_scatter,
+                length_scatter=mirror.width_scatter, coupling=mirror.coupling,
+            )  # fmt: skip
+        if shape == "gaussian":
+            return InfluenceFunctions(
+                positions, pitch, coupling, width=1 + mirror.width_scatter * truth.standard_normal(n),
+                gain=1 + mirror.gain_scatter * truth.standard_normal(n), wing=mirror.wing_fraction,
+            )  # fmt: skip
+        gain = 1 + mirror.gain_scatter * truth.standard_normal(n)
+        if shape == "thin-plate":
+            surfaces, pixel = thin_plate_surfaces(positions / pitch, coupling)
+            return MeasuredInfluenceFunctions(surfaces, pixel * pitch, gain)
+        if mirror.influence_pixel_m is None:
+            raise ConfigError("twin.mirror.influence_pixel_m is required with twin.mirror.influence_file")
+        surfaces = read_influence_functions(mirror.influence_file, n)
+        return MeasuredInfluenceFunctions(surfaces, mirror.influence_pixel_m, gain)
 
     def _make_aberration(self, truth: np.random.Generator, rms_m: float, n_modes: int) -> NDArray[np.float32]:
         """Random low-order polynomials, orthonormal over the pupil, of ``rms_m`` over it."""

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from escape_hw.api.registration import PARAMETERS, Registration
 from escape_sim.mirror.influence_functions import InfluenceFunctions, MeasuredInfluenceFunctions
+from escape_sim.mirror.rounded_exponential import ExponentialInfluenceFunctions
 
 if TYPE_CHECKING:
     from escape_hw.config.twin import TwinDrift
@@ -26,7 +27,7 @@ _GEMM_SPEEDUP = 6.0
 
 
 #: Influence functions of a mirror under any registration.
-InfluenceModel = InfluenceFunctions | MeasuredInfluenceFunctions
+InfluenceModel = InfluenceFunctions | MeasuredInfluenceFunctions | ExponentialInfluenceFunctions
 #: Surface ``(n_y, n_x)`` in fractions of full stroke for a command ``(n_act,)``, on a fixed grid.
 SurfaceFunction = Callable[[NDArray[np.float64]], NDArray[np.float32]]
 

@@ -30,6 +30,11 @@ class DesignModel:
         return self._nominal.n_act
 
     @property
+    def actuator_positions_m(self) -> NDArray[np.float64]:
+        """Nominal positions of the actuators ``(n_act, 2)`` as (x, y) on the pupil in metres."""
+        return self._nominal.positions_m
+
+    @property
     def sub_aperture_m(self) -> float:
         """Size of a sub-aperture, or of a pixel of the pupil image, on the pupil in metres."""
         return self._pupil.sub_aperture_m

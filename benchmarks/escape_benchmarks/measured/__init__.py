@@ -1,0 +1,1 @@
+"""Real calibration data: readers of folders that are next to the project, with their ``README.md``."""

@@ -1,0 +1,139 @@
+"""Whether a solution of SPRINT may be used: what does not fit, and where.
+
+A fit counts as converged when its steps ended, the gain is significant, the registration is within what the
+search covers, the data constrain every parameter, and the model explains the matrix to within its noise and a
+small misfit.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from escape_hw.api.interaction_matrix import InteractionMatrix
+from escape_hw.api.registration import PARAMETERS, Registration
+from escape_hw.api.synthetic_model import SyntheticModel
+from escape_hw.calibration.sprint.coarse_search import MIN_EXPLAINED_FRACTION
+from escape_hw.calibration.sprint.diagnostics import check_orientation
+from escape_hw.calibration.sprint.weighted_matrix import WeightedMatrix
+
+#: Largest rms of the residual beyond the noise, relative to that of the matrix. A tenth is what the best
+#: known description of a real mirror leaves; beyond it scalings and rotation are those of a wrong model.
+_MAX_MISFIT = 0.15
+#: Excess of the sum of squares, in its standard deviations for independent noise, that counts as a misfit.
+_SIGNIFICANT = 10.0
+#: Gain in standard errors below which the sensor does not see the mirror.
+_MIN_GAIN_SIGNIFICANCE = 5.0
+#: Largest scaling in % and rotation in degrees: the search covers half of them.
+_MAX_SCALING, _MAX_ROTATION = 20.0, 30.0
+#: A sub-aperture or actuator whose rms residual exceeds the median one by this factor is named, so many at
+#: most.
+_OUTLIER, _MAX_NAMED = 3.0, 12
+
+
+def misfit_fraction(weighted: WeightedMatrix, residual: NDArray[np.float64]) -> float:
+    """Rms of the residual beyond the noise, relative to that of the matrix; 0 where it is not significant.
+
+    Parameters
+    ----------
+    weighted
+        The matrix in units of its standard errors; without them all of the residual is misfit.
+    residual
+        Data minus model ``(n_slopes, n_modes)`` in the same units.
+    """
+    n = residual.size if weighted.has_standard_errors else 0
+    excess = float(np.square(residual).sum()) - n
+    signal = float(np.square(weighted.data).sum()) - n
+    if excess <= _SIGNIFICANT * np.sqrt(2.0 * n) or signal <= 0:
+        return 0.0
+    return float(np.sqrt(excess / signal))
+
+
+def describe_outliers(weighted: WeightedMatrix, residual: NDArray[np.float64]) -> str:
+    """Name the sub-apertures and actuators with outlying residuals; empty if there are none."""
+    by_sub_aperture = np.square(residual).sum(axis=1).reshape(2, -1).sum(axis=0)
+    modes = weighted.modes
+    commanded = residual @ np.linalg.pinv(modes)
+    by_actuator = np.square(commanded).sum(axis=0)
+    rows, columns = np.nonzero(weighted.valid)
+    places = [f"({row}, {column})" for row, column in zip(rows, columns, strict=True)]
+    parts = []
+    for kind, power, names in (
+        ("sub-apertures (row, column)", by_sub_aperture, places),
+        ("actuators", by_actuator, [str(a) for a in range(len(by_actuator))]),
+    ):
+        ratio = np.sqrt(power / max(float(np.median(power)), 1e-300))
+        worst = [k for k in np.argsort(-ratio).tolist() if ratio[k] > _OUTLIER]
+        if worst:
+            more = f" and {len(worst) - _MAX_NAMED} more" if len(worst) > _MAX_NAMED else ""
+            parts.append(f"{kind} {', '.join(names[k] for k in worst[:_MAX_NAMED])}{more}")
+    return "; ".join(parts)
+
+
+def check_fit(
+    matrix: InteractionMatrix,
+    model: SyntheticModel,
+    columns: NDArray[np.intp],
+    weighted: WeightedMatrix,
+    residual: NDArray[np.float64],
+    gain: float,
+    gain_sigma: float,
+    registration: Registration,
+) -> list[str]:
+    """Reasons not to use a solution whose steps ended; none if the model fits.
+
+    Parameters
+    ----------
+    matrix, model, columns
+        The fitted columns of the measured matrix, and the synthetic model.
+    weighted, residual
+        The matrix in units of its standard errors, and data minus model ``(n_slopes, n_modes)`` in the same
+        units.
+    gain, gain_sigma, registration
+        The solution.
+    """
+    reasons = []
+    explained, signal = weighted.explained_fraction(residual), weighted.signal_fraction
+    misfit = misfit_fraction(weighted, residual)
+    if abs(gain) < _MIN_GAIN_SIGNIFICANCE * gain_sigma:
+        reasons.append(
+            f"the gain is {gain:.3g} +- {gain_sigma:.2g}: the slopes hardly follow the commands; does the "
+            "mirror move, and does its light reach the sensor?"
+        )
+    elif explained < MIN_EXPLAINED_FRACTION * signal or np.vdot(weighted.data - residual, weighted.data) <= 0:
+        hint = check_orientation(matrix, model, columns)
+        reasons.append(
+            f"the model explains {max(explained, 0.0):.0%} of the matrix where noise leaves {signal:.0%} "
+            f"to explain; {hint or 'wrong layout, flip or basis, or a registration beyond capture'}"
+        )
+    elif gain < 0:
+        reasons.append(
+            "the gain is negative: the mirror pulls where the model pushes; check its polarity, "
+            "or whether the camera is turned by 180 degrees"
+        )
+    elif misfit > _MAX_MISFIT:
+        outliers = describe_outliers(weighted, residual)
+        where = f"worst: {outliers}" if outliers else "no part stands out"
+        reasons.append(
+            f"the model does not fit: {misfit:.0%} of the matrix remain beyond its noise (reduced "
+            f"chi-squared {np.mean(np.square(residual)):.3g}); {where}"
+        )
+    return reasons + _implausible_values(registration)
+
+
+def _implausible_values(registration: Registration) -> list[str]:
+    """Reasons why a registration cannot be that of a mirror and a sensor that were aligned to each other."""
+    reasons = []
+    for name in PARAMETERS[3:]:
+        value = float(getattr(registration, name))
+        if abs(value) > _MAX_SCALING:
+            reasons.append(
+                f"{name.replace('_', ' ')} is {value:.0f} %, beyond {_MAX_SCALING:.0f} %: check the layout, "
+                "the pitch and the number of sub-apertures"
+            )
+    if abs(registration.rotation) > _MAX_ROTATION:
+        reasons.append(
+            f"rotation is {registration.rotation:.0f} degrees, beyond {_MAX_ROTATION:.0f}: check the layout "
+            "and the flips"
+        )
+    return reasons

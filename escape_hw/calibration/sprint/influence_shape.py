@@ -1,0 +1,175 @@
+"""Common shape of the influence functions, fitted beside the registration.
+
+A model gives the slopes of nominal influence functions of any width. Sums of them approximate the mirrors
+that exist: a radial profile is a sum of nominal functions of several widths (an exponential of the distance,
+as of membrane mirrors, is a positive sum of Gaussians: Bernstein's theorem), a four-fold term is a ring of
+eight shifted functions of alternating sign, and the functions of edge actuators have shares and an outward
+asymmetry of their own. All terms are linear in the slopes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from escape_hw.api.registration import Registration
+from escape_hw.api.synthetic_model import HasActuatorPositions, SyntheticModel
+from escape_hw.calibration.modes.derivatives import zonal_jacobian
+
+#: Widths of the components of the radial profile, relative to the nominal one.
+PROFILE_WIDTHS = (0.35, 0.6, 1.7, 2.9)
+#: Lobes of the four-fold terms: distance in pitches, and width relative to the nominal one.
+_FOURFOLD_LOBES = ((0.4, 0.35), (0.8, 0.6), (1.6, 1.0))
+_N_LOBES = 8
+#: Prior standard deviations of the coefficients: shares of the profile, four-fold terms, and gain, width,
+#: shares and outward asymmetry (per pitch) of the edge actuators. They only regularise: measured mirrors have
+#: a third of them.
+_PROFILE_SIGMA, _FOURFOLD_SIGMA = 0.3, 0.05
+_EDGE_GAIN_SIGMA, _EDGE_WIDTH_SIGMA, _EDGE_PROFILE_SIGMA, _EDGE_ASYMMETRY_SIGMA = 0.2, 0.1, 0.1, 0.1
+#: Changes of registration, in its units, and width below which these terms, a few per cent of the matrix, are
+#: kept.
+_KEEP_WITHIN = np.array([5.0, 5.0, 0.1, 0.2, 0.2, 0.01])
+#: Actuators closer than this many pitches are neighbours.
+_NEIGHBOUR_DISTANCE = 1.3
+#: Squared standard deviation of a Gaussian of coupling 0.4 in squared pitches: the scale of the asymmetry.
+_SQUARED_WIDTH = 0.55
+
+
+@dataclass(slots=True, eq=False)
+class ShapedMatrix:
+    """Zonal matrix of the shaped influence functions and its derivatives.
+
+    Parameters
+    ----------
+    nominal, base
+        Slopes per unit command of the nominal influence functions ``(n_slopes, n_act)``, and their
+        derivatives by the registration and the width ``(6, n_slopes, n_act)``.
+    matrix, jacobian
+        The same of the shaped ones.
+    terms
+        Derivative by each coefficient ``(n_slopes, n_act)``.
+    """
+
+    nominal: NDArray[np.float64]
+    base: NDArray[np.float64]
+    matrix: NDArray[np.float64]
+    jacobian: NDArray[np.float64]
+    terms: list[NDArray[np.float64]]
+
+
+class InfluenceShape:
+    """Terms of the common shape of a model's influence functions.
+
+    Without the positions of the actuators (:class:`~escape_hw.api.synthetic_model.HasActuatorPositions`) only
+    the radial profile is fitted.
+
+    Parameters
+    ----------
+    model
+        The synthetic model.
+    """
+
+    def __init__(self, model: SyntheticModel) -> None:
+        self._model = model
+        self._widths = PROFILE_WIDTHS
+        n = len(self._widths)
+        self.names = [f"profile_{width:g}" for width in self._widths]
+        sigma = [_PROFILE_SIGMA] * n
+        self._edge: NDArray[np.float64] | None = None
+        if isinstance(model, HasActuatorPositions):
+            positions = np.asarray(model.actuator_positions_m)
+            distance = np.linalg.norm(positions[:, None] - positions, axis=2)
+            pitch = float(np.median(np.sort(distance, axis=1)[:, 1]))
+            self._edge = find_edge_actuators(positions).astype(float)
+            self._pitch = 100 * pitch / model.sub_aperture_m
+            centred = positions - positions.mean(axis=0)
+            outward = centred / np.maximum(np.linalg.norm(centred, axis=1), 1e-9 * pitch)[:, None]
+            self._outward = _SQUARED_WIDTH * self._pitch * outward.T
+            self.names += [f"fourfold_{distance:g}" for distance, _ in _FOURFOLD_LOBES]
+            self.names += ["edge_gain", "edge_width", *(f"edge_{name}" for name in self.names[:n])]
+            self.names += [f"edge_asymmetry_{width:g}" for width in (1.0, *self._widths)]
+            sigma += [_FOURFOLD_SIGMA] * len(_FOURFOLD_LOBES) + [_EDGE_GAIN_SIGMA, _EDGE_WIDTH_SIGMA]
+            sigma += [_EDGE_PROFILE_SIGMA] * n + [_EDGE_ASYMMETRY_SIGMA] * (n + 1)
+        self.prior_sigma = np.array(sigma)
+        self._fourfold_at: NDArray[np.float64] | None = None
+        self._fourfold: list[NDArray[np.float64]] = []
+
+    @property
+    def n_terms(self) -> int:
+        """Number of coefficients."""
+        return len(self.names)
+
+    def linearise(
+        self, registration: Registration, width: float, coefficients: NDArray[np.float64]
+    ) -> ShapedMatrix:
+        """The shaped zonal matrix and its derivatives.
+
+        Parameters
+        ----------
+        registration, width
+            As for :meth:`~escape_hw.api.synthetic_model.SyntheticModel.zonal_matrix`.
+        coefficients
+            Coefficient of each term ``(n_terms,)``.
+        """
+        nominal, base = zonal_jacobian(self._model, registration, width)
+        jacobian, profile, outward = base.copy(), [], [self._outward_derivative(base)]
+        for relative_width, share in zip(self._widths, coefficients, strict=False):
+            component, derivatives = zonal_jacobian(self._model, registration, width * relative_width)
+            derivatives[5] *= relative_width
+            jacobian += share * (derivatives - base)
+            profile.append(component - nominal)
+            outward.append(relative_width**2 * self._outward_derivative(derivatives))
+        terms = profile
+        if self._edge is not None:
+            terms = terms + self._fourfold_terms(registration, width)
+            common = _add(nominal, coefficients, terms)
+            terms += [self._edge * part for part in (common, width * jacobian[5], *profile, *outward)]
+        return ShapedMatrix(nominal, base, _add(nominal, coefficients, terms), jacobian, terms)
+
+    def _outward_derivative(self, jacobian: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Derivative by outward positions of the actuators ``(n_slopes, n_act)``."""
+        if self._edge is None:
+            return np.zeros(jacobian.shape[1:])
+        return np.asarray(jacobian[0] * self._outward[0] + jacobian[1] * self._outward[1])
+
+    def _fourfold_terms(self, registration: Registration, width: float) -> list[NDArray[np.float64]]:
+        """Lobes along the axes of the mirror less those between them; their derivatives are neglected."""
+        at = np.append(registration.to_array(), width)
+        if self._fourfold_at is not None and (np.abs(at - self._fourfold_at) < _KEEP_WITHIN).all():
+            return self._fourfold
+        affine, _ = registration.affine(self._model.sub_aperture_m)
+        terms = []
+        for distance, relative_width in _FOURFOLD_LOBES:
+            term = np.zeros((0, 0))
+            for number in range(_N_LOBES):
+                angle = 2 * np.pi * number / _N_LOBES
+                shift = affine @ (self._pitch * distance * np.array([np.cos(angle), np.sin(angle)]))
+                shifted = replace(
+                    registration,
+                    shift_x=registration.shift_x + float(shift[0]),
+                    shift_y=registration.shift_y + float(shift[1]),
+                )
+                lobe = (-1) ** number * self._model.zonal_matrix(shifted, width * relative_width)
+                term = lobe if number == 0 else term + lobe
+            terms.append(term)
+        self._fourfold_at, self._fourfold = at, terms
+        return terms
+
+
+def find_edge_actuators(positions_m: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Actuators with fewer neighbours than the median ``(n_act,)``, from positions ``(n_act, 2)``."""
+    distance = np.linalg.norm(positions_m[:, None] - positions_m, axis=2)
+    pitch = np.median(np.sort(distance, axis=1)[:, 1])
+    neighbours = (distance < _NEIGHBOUR_DISTANCE * pitch).sum(axis=1)
+    return np.asarray(neighbours < np.median(neighbours))
+
+
+def _add(
+    nominal: NDArray[np.float64], coefficients: NDArray[np.float64], terms: list[NDArray[np.float64]]
+) -> NDArray[np.float64]:
+    total = nominal.copy()
+    for coefficient, term in zip(coefficients, terms, strict=False):
+        total += coefficient * term
+    return total

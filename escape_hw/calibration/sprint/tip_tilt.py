@@ -1,0 +1,79 @@
+"""Sensors that remove tip and tilt from their slopes.
+
+Some control systems subtract the mean x and y slope from every frame. Their interaction matrices have columns
+of zero mean, which a synthetic model reproduces when its columns are treated alike.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from escape_hw.api.interaction_matrix import InteractionMatrix
+from escape_hw.api.registration import Registration
+from escape_hw.api.synthetic_model import SyntheticModel
+from escape_hw.calibration.modes.derivatives import modal_jacobian, modal_matrix, zonal_jacobian
+
+#: Mean slope of a column relative to its rms below which its tip and tilt count as removed: rounding in
+#: single precision leaves 1e-6, a measured column about its noise over the root of the number of slopes.
+_NEGLIGIBLE_MEAN = 1e-4
+
+
+def is_tip_tilt_removed(matrix: InteractionMatrix) -> bool:
+    """Whether the mean x and y slopes of all columns vanish."""
+    axes = matrix.data.astype(float).reshape(2, -1, matrix.n_modes)
+    rms = np.sqrt(np.square(axes).mean())
+    return bool(np.abs(axes.mean(axis=1)).max() < _NEGLIGIBLE_MEAN * rms)
+
+
+def remove_tip_tilt(slopes: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Slopes ``(..., n_slopes, n)``, all x then all y, without their means along each axis."""
+    axes = slopes.reshape(*slopes.shape[:-2], 2, -1, slopes.shape[-1])
+    return np.asarray((axes - axes.mean(axis=-2, keepdims=True)).reshape(slopes.shape))
+
+
+class TipTiltFreeModel:
+    """A differentiable synthetic model whose slopes have no mean.
+
+    Parameters
+    ----------
+    model
+        The model of a sensor that keeps them; its other attributes are passed on.
+    """
+
+    def __init__(self, model: SyntheticModel) -> None:
+        self._model = model
+
+    def zonal_matrix(self, registration: Registration, width: float = 1.0) -> NDArray[np.float64]:
+        """Slopes per unit command ``(n_slopes, n_act)``."""
+        return remove_tip_tilt(self._model.zonal_matrix(registration, width))
+
+    def zonal_jacobian(
+        self, registration: Registration, width: float = 1.0
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Zonal matrix and its derivatives ``(6, n_slopes, n_act)``."""
+        matrix, derivatives = zonal_jacobian(self._model, registration, width)
+        return remove_tip_tilt(matrix), remove_tip_tilt(derivatives)
+
+    def modal_matrix(
+        self, registration: Registration, m2c: NDArray[np.float64], width: float = 1.0
+    ) -> NDArray[np.float64]:
+        """Slopes per unit mode ``(n_slopes, n_modes)``."""
+        return remove_tip_tilt(modal_matrix(self._model, registration, m2c, width))
+
+    def modal_jacobian(
+        self, registration: Registration, m2c: NDArray[np.float64], width: float = 1.0
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Modal matrix and its derivatives ``(6, n_slopes, n_modes)``."""
+        matrix, derivatives = modal_jacobian(self._model, registration, m2c, width)
+        return remove_tip_tilt(matrix), remove_tip_tilt(derivatives)
+
+    def variants(self) -> Sequence[TipTiltFreeModel]:
+        """The model's variants, treated alike."""
+        return [TipTiltFreeModel(variant) for variant in self._model.variants()]
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._model, name)

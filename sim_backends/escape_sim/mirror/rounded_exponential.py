@@ -1,0 +1,124 @@
+"""Influence functions as of membrane mirrors: rounded exponentials that differ between actuators."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from escape_hw.api.registration import Registration
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ExponentialInfluenceFunctions:
+    """Rounded exponentials, one set of parameters per actuator.
+
+    The surface per unit command at a distance of ``r`` pitches in the direction ``theta`` is ``gain (1 + s u)
+    (1 + f t cos 4 theta) exp(-(sqrt(r^2 + w^2) - w) / L)`` with the distance ``u`` outwards in pitches and
+    ``t = r^4 / (r^2 + w^2)^2``. Scalings and rotation of a registration act on the whole surface, shapes
+    included.
+
+    Parameters
+    ----------
+    positions_m
+        Positions ``(n_act, 2)`` as (x, y) on the pupil in metres.
+    pitch_m
+        Actuator pitch on the pupil in metres.
+    length, rounding
+        ``L`` and ``w`` in pitches ``(n_act,)``.
+    gain
+        Gain of each actuator ``(n_act,)``.
+    fourfold
+        ``f``, the four-fold term ``(n_act,)``.
+    slope
+        ``s``, the relative asymmetry per pitch outwards ``(n_act,)``.
+    """
+
+    positions_m: NDArray[np.float64]
+    pitch_m: float
+    length: NDArray[np.float64]
+    rounding: NDArray[np.float64]
+    gain: NDArray[np.float64]
+    fourfold: NDArray[np.float64]
+    slope: NDArray[np.float64]
+
+    @property
+    def n_act(self) -> int:
+        """Number of actuators."""
+        return len(self.positions_m)
+
+    def surfaces(
+        self,
+        registration: Registration,
+        sub_aperture_m: float,
+        x_m: NDArray[np.float64],
+        y_m: NDArray[np.float64],
+    ) -> NDArray[np.float64]:
+        """Surfaces per unit command ``(n_act, n_y, n_x)``, fractions of full stroke."""
+        matrix, offset = registration.affine(sub_aperture_m)
+        inverse = np.linalg.inv(matrix) / self.pitch_m
+        x, y = x_m - offset[0], y_m - offset[1]
+        out = np.empty((self.n_act, y_m.size, x_m.size))
+        outward = self.positions_m / np.maximum(np.linalg.norm(self.positions_m, axis=1), 1e-12)[:, None]
+        for a, position in enumerate(self.positions_m / self.pitch_m):
+            u = inverse[0, 0] * x + inverse[0, 1] * y[:, None] - position[0]
+            v = inverse[1, 0] * x + inverse[1, 1] * y[:, None] - position[1]
+            r2 = u**2 + v**2
+            rounded2 = r2 + self.rounding[a] ** 2
+            profile = np.exp(-(np.sqrt(rounded2) - self.rounding[a]) / self.length[a])
+            if self.fourfold[a]:
+                # r^4 cos(4 theta) as a polynomial.
+                profile *= 1 + self.fourfold[a] * (u**4 - 6 * u**2 * v**2 + v**4) / rounded2**2
+            if self.slope[a]:
+                along = u * outward[a, 0] + v * outward[a, 1]
+                profile *= 1 + self.slope[a] * along
+            out[a] = self.gain[a] * profile
+        return out
+
+
+#: Ranges of the measured ALPAO DM97-15 mirrors: length and rounding in pitches, four-fold term.
+_LENGTH, _ROUNDING, _FOURFOLD = (0.75, 1.05), (0.18, 0.35), (-0.02, 0.04)
+#: Their edge actuators: relative length and gain beyond the others, and asymmetry per pitch outwards.
+_EDGE_LENGTH, _EDGE_GAIN, _EDGE_SLOPE = 0.05, 0.12, 0.06
+#: Width of the ring of edge actuators in pitches.
+_EDGE_RING = 0.75
+#: Scatter of the positions in pitches.
+_POSITION_SCATTER = 0.01
+
+
+def draw_exponential(
+    positions_m: NDArray[np.float64],
+    pitch_m: float,
+    rng: np.random.Generator,
+    *,
+    gain_scatter: float,
+    length_scatter: float,
+    coupling: float | None = None,
+) -> ExponentialInfluenceFunctions:
+    """Draw a mirror as the measured ALPAO DM97-15 mirrors are.
+
+    Parameters
+    ----------
+    positions_m, pitch_m
+        Nominal positions ``(n_act, 2)`` as (x, y) and pitch on the pupil in metres.
+    rng
+        Generator of the draw.
+    gain_scatter, length_scatter
+        Scatter of the gains and lengths between actuators, rms fractions.
+    coupling
+        Relative surface one pitch away, which sets the length; drawn if absent.
+    """
+    radius = np.linalg.norm(positions_m, axis=1)
+    n, edge = len(positions_m), radius > radius.max() - _EDGE_RING * pitch_m
+    length, rounding = rng.uniform(*_LENGTH), rng.uniform(*_ROUNDING)
+    if coupling is not None:
+        length = (np.hypot(1, rounding) - rounding) / -np.log(coupling)
+    fourfold = rng.uniform(*_FOURFOLD)
+    gain = 1 + gain_scatter * rng.standard_normal(n)
+    lengths = length * (1 + length_scatter * rng.standard_normal(n))
+    return ExponentialInfluenceFunctions(
+        positions_m + _POSITION_SCATTER * pitch_m * rng.standard_normal((n, 2)), pitch_m,
+        lengths * np.where(edge, 1 + _EDGE_LENGTH, 1.0), np.full(n, rounding),
+        gain * np.where(edge, 1 + _EDGE_GAIN, 1.0), np.full(n, fourfold), np.where(edge, _EDGE_SLOPE, 0.0),
+    )  # fmt: skip
