@@ -333,10 +333,16 @@ class SimBench:
 
 
 class _Exposures:
-    """Sums of focal-plane images, one per science frame."""
+    """Sums of focal-plane images, one per science frame.
+
+    A late reader gets the newest complete frame. Sums of older frames are discarded, so that the memory does
+    not grow while the science camera runs and is not read.
+    """
 
     #: Wavefront-sensor frames per sample of the focal plane.
     STRIDE = 4
+    #: Sums that are kept: the frame being exposed, the newest complete one, and one for rounded times.
+    MAX_SUMS = 3
 
     def __init__(self, plane: FocalPlane, start_s: float, exposure_s: float, period_s: float) -> None:
         self._plane, self._start, self.exposure_s, self._period = plane, start_s, exposure_s, period_s
@@ -356,9 +362,13 @@ class _Exposures:
         image = self._plane.image(opd)
         total, count = self._sums.get(number, (np.zeros_like(image), 0))
         self._sums[number] = (total + image, count + 1)
+        self._discard_before(number - self.MAX_SUMS + 1)
 
     def pop_mean(self, number: int) -> NDArray[np.float32]:
         total, count = self._sums.pop(number)
+        self._discard_before(number)
+        return np.asarray(total / np.float32(count))
+
+    def _discard_before(self, number: int) -> None:
         for old in [k for k in self._sums if k < number]:
             del self._sums[old]
-        return np.asarray(total / np.float32(count))
