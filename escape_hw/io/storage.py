@@ -83,6 +83,22 @@ def check_writable(folder: Path, need_bytes: int = 0) -> None:
         raise storage_error(folder, error) from error
 
 
+def check_readable(folder: Path) -> None:
+    """Refuse a folder whose files cannot be listed.
+
+    Raises
+    ------
+    StorageError
+        It does not exist, is no folder, or may not be read.
+    """
+    try:
+        with os.scandir(folder):
+            return
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise StorageError(f"{folder}: cannot be read ({reason}); choose an existing folder") from error
+
+
 def write_atomic(path: Path, content: bytes) -> None:
     """Write a file that appears whole or not at all, and survives a power cut once it has appeared.
 

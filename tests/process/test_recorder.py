@@ -280,3 +280,29 @@ os.kill(os.getpid(), signal.SIGKILL)
     assert name in document(capsys)["removed"]
     assert segments.read_identity(name) is None
     assert segments.read_identity(writer.name) is not None
+
+
+ORPHAN = """
+import os, signal, sys, time
+from pathlib import Path
+import numpy as np
+from escape_hw.streams.recording.process import RecorderProcess
+from escape_hw.streams.ring import RingWriter
+from escape_hw.streams.segments import segment_name
+writer = RingWriter(segment_name(sys.argv[2], "slopes"), 800, 64)
+recorder = RecorderProcess(Path(sys.argv[1]), {"slopes": writer.name})
+index = 0
+while recorder.state.written == 0:
+    writer.write(np.full(100, float(index)), index)
+    index += 1
+    time.sleep(0.002)
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_a_recorder_whose_parent_is_killed_prints_nothing(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", ORPHAN, str(tmp_path), SYSTEM], capture_output=True, text=True, timeout=60
+    )
+    assert done.returncode == -9
+    assert done.stderr == ""

@@ -40,17 +40,23 @@ def serve(
 ) -> None:
     """Open the devices of a system, and serve windows, scripts and notebooks until stopped."""
     from escape_hw.io.run_folder import default_runs_folder
+    from escape_hw.io.storage import check_readable, check_writable, make_folder
     from escape_hw.server.frontend.front_end import Server
 
     if port is None and bind != _LOOPBACK:
         raise ConfigError(f"--bind {bind} needs --port; without it the server has local sockets only")
     config = context.load_config(selection)
     runs = default_runs_folder() if out is None else out.expanduser().absolute()
+    read_folders = tuple(folder.expanduser().absolute() for folder in read or ())
+    make_folder(runs)
+    check_writable(runs)
+    for folder in read_folders:
+        check_readable(folder)
     with context.interrupts.protect_closing(Server(config, bind, port)) as server:
         _print_listing(context, config, server.listing)
         with context.interrupts.procedure() as stop:
             context.devices_opened = True
-            server.run(stop, runs, tuple(read or ()))
+            server.run(stop, runs, read_folders)
     context.notify("serve: stopped, mirror flat")
 
 

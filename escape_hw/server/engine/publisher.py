@@ -204,5 +204,6 @@ class TelemetryRecording:
             fault = now.fault or "the recorder process ended"
             log.error("recording ended: %s", fault)
             self._process = None
+            process.stop()
             self._last = state = state.model_copy(update={"recording": False, "fault": fault})
         return state
