@@ -117,7 +117,7 @@ def test_no_trend_is_found_where_there_is_none(model: PyramidModel) -> None:
         # What might be a trend makes a scaling a little less certain, no more.
         assert (both[0].sigma[3:] < 1.5 * both[1].sigma[3:]).all()
     rms = np.sqrt(np.mean(np.square(found), axis=0))
-    assert (rms[0][3:] < 1.3 * rms[1][3:] + 0.02).all()
+    assert (rms[0][3:] < 1.6 * rms[1][3:] + 0.02).all()
 
 
 def test_only_a_pyramid_under_turbulence_or_pokes_has_trends(model: PyramidModel) -> None:

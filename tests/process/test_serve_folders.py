@@ -12,7 +12,8 @@ import pytest
 
 @pytest.mark.timeout(60)
 @pytest.mark.parametrize(
-    "option", [("--read", "/nonexistent"), ("--read", "/dev/null"), ("--out", "/proc/x"), ("--out", "/dev/null")]
+    "option",
+    [("--read", "/nonexistent"), ("--read", "/dev/null"), ("--out", "/proc/x"), ("--out", "/dev/null")],
 )
 def test_a_folder_that_cannot_be_used_is_refused(
     escape: Callable[..., Any], system: Path, option: tuple[str, str]

@@ -146,7 +146,7 @@ def test_push_pull_takes_the_turbulence_out_and_puts_it_back(bench: escape_hw.Sy
     assert bench.screen.state.inserted
     assert result.matrix.method == "push-pull"
     estimate = bench.find_registration(result.matrix, result.grid)
-    assert estimate.converged
+    assert estimate.converged, estimate.warnings
     injected = bench.config.twin.registration.to_registration()
     error = estimate.registration.to_array() - injected.to_array()
     assert np.abs(error[:2]).max() < 10.0

@@ -124,7 +124,7 @@ def sprint(
     loss: Loss = "squares",
     learning_rate: float = 1.0,
     start: Registration | None = None,
-    max_iterations: int = 25,
+    max_iterations: int = 40,
     covariance: NDArray[np.float64] | None = None,
     priors: Priors | None = None,
     update_priors: bool = True,
@@ -220,7 +220,7 @@ def fit_registration(
     loss: Loss = "squares",
     learning_rate: float = 1.0,
     start: Registration | None = None,
-    max_iterations: int = 25,
+    max_iterations: int = 40,
     covariance: NDArray[np.float64] | None = None,
     priors: Priors | None = None,
     update_priors: bool = True,
@@ -382,7 +382,7 @@ def _build_estimate(
     model_sigma = systematic_error(context.model)
     covariance[np.arange(1, 6), np.arange(1, 6)] += np.square(model_sigma)
     sigma = np.sqrt(np.diag(covariance))
-    warnings = check_convergence(context, weighted, solution, sigma[1:6], float(sigma[GAIN]))
+    warnings = check_convergence(context, weighted, solution, sigma[1:6])
     return RegistrationEstimate(
         Registration.from_array(solution.alpha),
         covariance[1:6, 1:6],
@@ -402,7 +402,6 @@ def check_convergence(
     weighted: WeightedMatrix,
     solution: SprintSolution,
     sigma: NDArray[np.float64],
-    gain_sigma: float,
 ) -> tuple[str, ...]:
     """Reasons not to use a solution; none if SPRINT has converged.
 
@@ -413,12 +412,12 @@ def check_convergence(
     ----------
     context, weighted, solution
         The problem and its solution.
-    sigma, gain_sigma
-        Standard errors of the registration ``(5,)`` and of the gain.
+    sigma
+        Standard errors of the registration ``(5,)``.
     """
     warnings = check_fit(
         context.matrix, context.model, context.columns, weighted, solution.system.residual, solution.gain,
-        gain_sigma, Registration.from_array(solution.alpha),
+        Registration.from_array(solution.alpha),
     )  # fmt: skip
     # A large misfit of the model prevents steps as small as the noise alone would allow.
     steps_converged = solution.steps_converged or (

@@ -262,7 +262,8 @@ class MixedEffectsProblem:
             list(groups.values()),
             [np.divide(bounds[name], scatter) for name, scatter in zip(groups, present, strict=True)], noise,
         )  # fmt: skip
-        scatter = dict(zip(groups, (present * ratios).tolist(), strict=True))
+        # The fit takes the noise as one: relative to a larger one the priors are narrower.
+        scatter = dict(zip(groups, (present * ratios / noise).tolist(), strict=True))
         # The slope gains were eliminated: one step of expectation and maximisation (Dempster, Laird & Rubin
         # 1977).
         variance = system.posterior_variance()

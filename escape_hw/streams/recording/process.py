@@ -82,7 +82,8 @@ def main() -> None:
 
     def print_state(state: RecordingProgress) -> None:
         try:
-            # Not through sys.stdout, whose buffer is flushed at exit: that fails again when the reader is gone.
+            # Not through sys.stdout, whose buffer is flushed at exit: that fails again when the reader is
+            # gone.
             os.write(1, json.dumps(asdict(state)).encode() + b"\n")
         except BrokenPipeError:
             stop.set()
