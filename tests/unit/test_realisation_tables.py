@@ -37,6 +37,6 @@ def test_realisations_of_other_settings_are_not_mixed_with_these(tables, tmp_pat
     target = tmp_path / "lines.jsonl"
     tables.each_realisation(target, {"frames": 20}, [0], lambda number: {})
     before = target.read_bytes()
-    with pytest.raises(SystemExit, match=r"lines\.jsonl has realisations that were asked for otherwise"):
+    with pytest.raises(SystemExit, match=r"lines\.jsonl has realisations with other settings"):
         tables.each_realisation(target, {"frames": 50}, [1], lambda number: {})
     assert target.read_bytes() == before

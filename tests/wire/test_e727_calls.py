@@ -198,8 +198,8 @@ def test_a_stop_by_another_client_is_noticed(emulator):
     ("override", "says"),
     [
         ('devices.modulator.serial="42"', r"found the controller with serial number 'SIMMOD', not '42'"),
-        ('devices.modulator.stage.axes=["1","4"]', r"has no axis '4', only 1, 2, 3"),
-        ('devices.modulator.stage.axes=["1","3"]', r"axis 3 carries no stage"),
+        ('devices.modulator.stage.axes=["1","4"]', r"has no axis '4', only 1, 2;"),
+        ('devices.modulator.stage.axes=["1","3"]', r"has no axis '3', only 1, 2;"),
     ],
 )
 def test_the_wrong_controller_is_left_alone(emulator, override, says):
