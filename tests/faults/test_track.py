@@ -87,7 +87,10 @@ def test_a_drift_is_followed_and_exchanged_without_a_transient(start, monkeypatc
     assert all(one.mismatch > 2 * one.mismatch_sigma for one in accepted)
     assert found.column("exchanged").sum() == len(accepted)
     command, residual = np.array(steps).T
-    for at in swaps:
+    # The last exchange may come with the last frames.
+    complete = [at for at in swaps if at + 5 <= len(command)]
+    assert complete
+    for at in complete:
         # The frames after an exchange are like those before it.
         before, after = slice(at - 100, at), slice(at, at + 5)
         assert command[after].max() < 1.5 * command[before].max()
