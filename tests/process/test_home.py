@@ -21,14 +21,26 @@ def homes(tmp_path_factory) -> dict[str, str]:
     return {"unreadable": str(unreadable), "missing": "/nonexistent", "no folder": "/dev/null"}
 
 
+@pytest.fixture(scope="module")
+def other_user() -> tuple[str, ...]:
+    """Words that run a command without privileges; skips where that user cannot read the package."""
+    if os.getuid() != 0:
+        return ()
+    if shutil.which("setpriv") is None:
+        pytest.skip("needs setpriv to become another user")
+    words = ("setpriv", f"--reuid={NOBODY}", f"--regid={NOBODY}", "--clear-groups")
+    probe = [*words, sys.executable, "-c", "import escape_hw.cli, escape_sim, escape_drivers"]
+    if subprocess.run(probe, capture_output=True, check=False, cwd="/").returncode:
+        pytest.skip(f"user {NOBODY} cannot read the installed package")
+    return words
+
+
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="users of Linux")
 @pytest.mark.parametrize("home", ["unreadable", "missing", "no folder"])
 @pytest.mark.parametrize(
     "words", ["systems", "show IM", "doctor", "keys make", "keys list", "calibrate", "docrime"]
 )
-def test_a_home_that_cannot_be_used(homes, im, system, tmp_path, home, words):
-    if os.getuid() == 0 and shutil.which("setpriv") is None:
-        pytest.skip("needs setpriv to become another user")
+def test_a_home_that_cannot_be_used(homes, other_user, im, system, tmp_path, home, words):
     command = {
         "show IM": ("show", "im.fits"),
         "calibrate": ("calibrate", "small.toml", "--method", "docrime", "--frames", 100),
@@ -41,9 +53,8 @@ def test_a_home_that_cannot_be_used(homes, im, system, tmp_path, home, words):
         shutil.copy(im, place / "im.fits")
         shutil.copy(system, place / "small.toml")
         kept = {name: value for name, value in os.environ.items() if not name.startswith("XDG_")}
-        other_user = ("setpriv", f"--reuid={NOBODY}", f"--regid={NOBODY}", "--clear-groups")
         done = subprocess.run(
-            [*(other_user if os.getuid() == 0 else ()), *ESCAPE, *map(str, command)],
+            [*other_user, *ESCAPE, *map(str, command)],
             capture_output=True, text=True, check=False, timeout=120, cwd=place,
             env={**kept, "HOME": homes[home]},
         )  # fmt: skip
