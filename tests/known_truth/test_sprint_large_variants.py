@@ -39,8 +39,8 @@ class Dull:
         )
 
 
-class Doubtful:
-    """A model that knows that its sensor may be dull."""
+class ModelWithVariant:
+    """A model with one variant, of a less sensitive sensor."""
 
     def __init__(self, sharp: SyntheticModel) -> None:
         self._sharp = sharp
@@ -64,7 +64,7 @@ def test_large_amplitudes_are_fitted_with_the_registration(seed: int) -> None:
     sigma = np.full(exact.shape, 0.05 * exact.std(), np.float32)
     data = (exact + sigma * rng.standard_normal(exact.shape)).astype(np.float32)
     matrix = InteractionMatrix(data, sigma, m2c, nominal_grid(config).valid, "razor-shwfs", "docrime", True)
-    estimate = run(fit_registration(matrix, Doubtful(sharp))).estimate
+    estimate = run(fit_registration(matrix, ModelWithVariant(sharp))).estimate
     assert estimate.converged, estimate.warnings
     assert len(estimate.iterations) <= 25
     pulls = (estimate.registration.to_array() - injected.to_array()) / np.sqrt(np.diag(estimate.covariance))

@@ -27,7 +27,7 @@ LIMITS = st.builds(
 )
 
 
-class Doubtful(RecordingMirror):
+class UnacknowledgedMirror(RecordingMirror):
     """A mirror whose transfers end as listed: ``ok``, ``lost`` before or ``late`` after they took effect."""
 
     def __init__(self, limits: MirrorLimits | None = None, ends: tuple[str, ...] = ()) -> None:
@@ -44,7 +44,7 @@ class Doubtful(RecordingMirror):
 
 @pytest.mark.parametrize("max_slew", [None, 0.3])
 def test_flatten_sends_after_a_lost_acknowledgement(max_slew: float | None) -> None:
-    with Doubtful(MirrorLimits(max_slew=max_slew)) as dm:
+    with UnacknowledgedMirror(MirrorLimits(max_slew=max_slew)) as dm:
         dm.flatten()
         dm.ends = ["late"]
         with pytest.raises(DeviceError):
@@ -71,7 +71,7 @@ def test_closing_flattens_a_mirror_whose_last_acknowledgement_was_lost() -> None
        seed=st.integers(0, 2**32 - 1))  # fmt: skip
 def test_the_true_steps_obey_the_slew_limit(limits: MirrorLimits, ends: list[str], seed: int) -> None:
     rng = np.random.default_rng(seed)
-    with Doubtful(limits) as dm:
+    with UnacknowledgedMirror(limits) as dm:
         dm.flatten()
         dm.ends = ends
         for _ in range(len(dm.ends)):
