@@ -14,6 +14,8 @@ from collections.abc import Callable, Iterable
 from types import TracebackType
 from typing import Any, Self, TextIO, TypeVar, cast
 
+from escape_hw.runtime.display.descriptors import redirect_to_null
+
 T = TypeVar("T")
 #: Exit code of a command whose results could not be written.
 _FAILED = 1
@@ -96,7 +98,7 @@ class FaultTolerantStream:
             self._works = False
             with contextlib.suppress(OSError, ValueError):
                 # Otherwise Python writes the buffer on exit and fails again.
-                _redirect_to_null(self.inner.fileno())
+                redirect_to_null(self.inner.fileno())
             self._on_failure(error)
 
 
@@ -145,13 +147,4 @@ def _reserve_descriptor(descriptor: int) -> None:
     try:
         os.fstat(descriptor)
     except OSError:
-        _redirect_to_null(descriptor)
-
-
-def _redirect_to_null(descriptor: int) -> None:
-    null = os.open(os.devnull, os.O_WRONLY)
-    if null != descriptor:
-        os.dup2(null, descriptor)
-        os.close(null)
-    else:
-        os.set_inheritable(descriptor, True)
+        redirect_to_null(descriptor)

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
+
 from rich.console import Console
+
+from escape_hw.runtime.display.descriptors import redirect_to_null
 
 
 class DisplayConsole(Console):
@@ -15,5 +19,7 @@ class DisplayConsole(Console):
         super().__init__(stderr=True)
 
     def on_broken_pipe(self) -> None:
-        """Raise the present ``BrokenPipeError``."""
+        """Send the rest of standard error to the null device and raise the present ``BrokenPipeError``."""
+        with contextlib.suppress(OSError, ValueError):  # a stream without a descriptor, as in a notebook
+            redirect_to_null(self.file.fileno())
         raise
