@@ -86,7 +86,7 @@ class ServerSection(Section):
         10.0,
         ge=2,
         le=600,
-        description="longest silence of the engine while the mirror is not flat, seconds; then it is killed",
+        description="longest silence of the engine while something runs or the mirror is not flat, seconds",
     )
     no_frames_s: float = Field(
         2.0, ge=0.2, le=600, description="longest time without a frame in closed loop, seconds"

@@ -195,17 +195,18 @@ def test_an_engine_that_hangs_is_ended_and_its_mirror_made_flat(system, bench, t
     server, spy = bench
     with (
         serving(
-            system, "--mode", "hardware", "--set", OPTIONS[0], "--set", "server.engine_silence_s=2",
+            system, "--mode", "hardware", "--set", OPTIONS[0], "--set", "server.engine_silence_s=5",
             folder=tmp_path, more=server.environment,
         ) as served,
         served.connect(control=True) as client,
     ):  # fmt: skip
         until_idle(client)
         client.start("docrime", frames=10_000_000)
+        # It hangs at once, perhaps before a state with the first poke was published.
         wait_for(lambda: not spy.flat and spy.last is not None, "the mirror is poked")
         os.kill(client.state.engine_pid, signal.SIGSTOP)
         wait_for(lambda: guarded(client), "the fail-safe process has ended")
-        assert "the engine was silent for 2." in client.state.fault.reason
+        assert "the engine was silent for 5." in client.state.fault.reason
         assert spy.flat
         with pytest.raises(RequestRefused, match="the engine has died; clear the fault to start it again"):
             client.start("docrime")

@@ -43,12 +43,24 @@ class PublishedState:
         self._transport.publish("state", self.state)
 
 
-#: Seconds that an engine may be silent while its mirror is flat.
+#: Seconds that an engine may be silent while its mirror is flat and nothing runs.
 IDLE_SILENCE_LIMIT_S = 120.0
 #: Seconds after which an engine is killed that has not made the mirror flat on request.
 _SAFETY_TIMEOUT_S = 5.0
 #: Seconds between two heartbeats to the engine.
 _HEARTBEAT_S = 1.0
+
+
+def silence_limit_s(state: State, limits: ServerSection) -> float:
+    """Seconds that an engine may be silent after this state.
+
+    A run may have moved the mirror since its last state: an engine that hangs then is not idle. Compilation on
+    a busy computer may delay an idle engine, which is harmless.
+    """
+    idle = state.active_run is None and not state.loop.closed and state.mirror.peak == 0
+    return IDLE_SILENCE_LIMIT_S if idle else limits.engine_silence_s
+
+
 _RESTART_REMEDY = "Read the log, then clear the fault to start the engine again."
 
 
@@ -167,9 +179,7 @@ class EngineSupervisor:
         if due:
             engine.maintain_failsafe(failsafe_is_running)
         state = self._published.state
-        # Compilation on a busy computer may delay an engine, which is harmless while the mirror is flat.
-        moving = state.mirror.peak > 0 or state.loop.closed
-        limit = self._limits.engine_silence_s if moving else IDLE_SILENCE_LIMIT_S
+        limit = silence_limit_s(state, self._limits)
         silence = now - engine.last_message_s
         if silence > limit:
             self._kill(engine, f"the engine was silent for {silence:.1f} s (limit {limit:g} s)")
