@@ -10,7 +10,17 @@ import pytest
 
 from escape_hw.cli import main
 from escape_hw.io.fits.matrix import save_matrix
-from escape_hw.report.run_report import write_report
+from escape_hw.report.figures import style
+from escape_hw.report.run_report import REPORT, write_report
+
+PNG = style.png
+
+
+def empty_report(folder):
+    """A page without content, in its place."""
+    path = folder / REPORT
+    path.write_text("")
+    return path
 
 
 @pytest.fixture
@@ -18,6 +28,7 @@ def bench(monkeypatch, tmp_path):
     """Fake devices and procedures, and no time spent on figures."""
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
     monkeypatch.setattr("escape_hw.runtime.procedures.products.write_report", lambda folder: folder)
+    monkeypatch.setattr(style, "png", lambda figure, dpi=150: b"")
     return fake_bench.install(monkeypatch)
 
 
@@ -25,6 +36,18 @@ def bench(monkeypatch, tmp_path):
 def reports(bench, monkeypatch):
     """The real report after all."""
     monkeypatch.setattr("escape_hw.runtime.procedures.products.write_report", write_report)
+
+
+@pytest.fixture
+def pictures(bench, monkeypatch):
+    """The real pictures after all."""
+    monkeypatch.setattr(style, "png", PNG)
+
+
+@pytest.fixture
+def empty_reports(bench, monkeypatch):
+    """Pages without content where the reports would be."""
+    monkeypatch.setattr("escape_hw.runtime.procedures.products.write_report", empty_report)
 
 
 @pytest.fixture

@@ -43,6 +43,15 @@ def test_reproduce_judges_its_own_result(document, bench, tmp_path):
     assert "injected registration" in failed[0]
 
 
+@pytest.mark.usefixtures("reports")
+def test_reproduce_table1_is_shown_in_its_report(escape, tmp_path):
+    run = tmp_path / "run"
+    assert escape("reproduce", "table1", "--out", run, "--short", 1000, "--long", 5000)[0] == 0
+    page = (run / "report.html").read_text()
+    for word in ("SIMULATED", "SPRINT convergence", "α SHORT", "α LONG"):
+        assert word in page, word
+
+
 def test_reproduce_table1(escape, document, bench, tmp_path):
     words = ("reproduce", "table1", "--out", tmp_path / "run", "--short", 1000, "--long", 5000)
     code, out, _ = escape(*words)
@@ -75,7 +84,7 @@ def test_reproduce_maps_shows_the_matrix_beside_its_simulation(escape, bench, tm
     assert load_loop(run / "loop_docrime.fits").header["PARENT1"] == "docrime.fits"
 
 
-@pytest.mark.usefixtures("reports")
+@pytest.mark.usefixtures("empty_reports", "pictures")
 def test_reproduce_all_leads_to_every_report(escape, document, bench, tmp_path):
     words = ("reproduce", "all", "--out", tmp_path / "all", "--only", "maps", "--only", "table1")
     code, out, _ = escape(*words, "--share", 0.1)
@@ -87,6 +96,9 @@ def test_reproduce_all_leads_to_every_report(escape, document, bench, tmp_path):
         assert (tmp_path / "all" / part / "report.html").is_file()
     assert any("index.html" in line for line in out.splitlines())
     assert (tmp_path / "all" / "results.md").is_file()
+    pictures = list((tmp_path / "all").glob("*.png"))
+    assert {"table1-convergence.png", "maps-matrices.png"} <= {path.name for path in pictures}, pictures
+    assert all(path.read_bytes().startswith(b"\x89PNG") for path in pictures)
     code, found, _ = document(*words)
     assert list(found["parts"]) == ["table1", "maps"]
     assert document("reproduce", "all", "--out", tmp_path / "x", "--only", "mops")[0] == 2
@@ -115,7 +127,7 @@ def test_too_small_a_share_is_refused_before_anything_runs(document, bench, tmp_
     assert found["parts"][kind]
 
 
-@pytest.mark.usefixtures("reports")
+@pytest.mark.usefixtures("empty_reports")
 def test_reproduce_all_continues_where_it_was(document, bench, tmp_path):
     words = ("reproduce", "all", "--out", tmp_path / "all", "--share", 0.1)
     first = document(*words, "--only", "maps")[1]["parts"]["maps"]
@@ -133,7 +145,7 @@ def test_reproduce_all_continues_where_it_was(document, bench, tmp_path):
         assert "was run with" in refused["error"]["message"]
 
 
-@pytest.mark.usefixtures("reports")
+@pytest.mark.usefixtures("empty_reports")
 def test_reproduce_all_takes_no_other_run_for_its_own(document, tmp_path):
     document("reproduce", "table1", "--out", tmp_path / "all" / "maps")
     words = ("reproduce", "all", "--out", tmp_path / "all", "--only", "maps", "--resume")

@@ -49,6 +49,7 @@ def test_a_loop_that_closes_at_no_gain_is_reported(monkeypatch):
 
 #: Gains of a scan, and Strehl ratios that rise steadily and fall steeply near the limit of stability.
 GAINS = np.array([0.228, 0.319, 0.41, 0.501, 0.592, 0.683])
+LOOP = fake_results.loop()
 
 
 def strehl_at(gain):
@@ -64,9 +65,7 @@ def fitted(sigma, rng=None, gains=GAINS):
     for gain in gains:
         value = strehl_at(gain) + (0.0 if rng is None else sigma * rng.standard_normal())
         ratio = Estimate(float(value), sigma)
-        runs.append(
-            replace(fake_results.loop(), gain=float(gain), strehl=StrehlEstimate(ratio, ratio, ratio))
-        )
+        runs.append(replace(LOOP, gain=float(gain), strehl=StrehlEstimate(ratio, ratio, ratio)))
     return gain_search._fit_peak(runs)
 
 

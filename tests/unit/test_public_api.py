@@ -14,12 +14,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from small_system import SMALL
 
 import escape_hw
 from escape_hw.errors import Aborted, ConfigError, IncompatibleProduct
 
-#: Enough for the 30 modes that the tests calibrate.
-FEW = ("basis.n_modes=30", "calibration.sprint_modes=30", "loop.dropped_modes=2")
+#: Enough for the 30 modes of the small bench.
 FRAMES = 300
 
 
@@ -95,7 +95,7 @@ def test_methods_and_procedures_have_the_same_defaults(method: str, procedure: s
 
 @pytest.fixture(scope="module")
 def bench() -> Iterator[escape_hw.System]:
-    with escape_hw.open_system("razor-shwfs", seed=5, set=FEW) as system:
+    with escape_hw.open_system("razor-shwfs", seed=5, set=SMALL) as system:
         yield system
 
 
@@ -126,7 +126,7 @@ def test_a_method_is_the_procedure_of_that_name(whiten: bool) -> None:
         lambda bench: bench.run(escape_hw.docrime(bench, frames=FRAMES, poke=0.01, whiten=whiten)),
     ]
     for call in calls:
-        with escape_hw.open_system("razor-shwfs", seed=6, set=FEW) as system:
+        with escape_hw.open_system("razor-shwfs", seed=6, set=SMALL) as system:
             measured.append(call(system))
     assert np.array_equal(measured[0].matrix.data, measured[1].matrix.data)
     assert measured[0].matrix.metrics["poke"] == 0.01
