@@ -8,7 +8,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
-from pages import EVERY, ROOT, Block, blocks_of, call, escape, spelled_right
+from pages import EVERY, ROOT, Block, Reader, blocks_of, call, spelled_right
 from quoted import differences
 
 DOCS = ROOT / "docs"
@@ -25,16 +25,16 @@ def name_of(page: Path) -> str:
     return str(page.relative_to(DOCS))
 
 
-def run_block(block: Block, folder: Path) -> str:
+def run_block(block: Block, reader: Reader) -> str:
     """Run a block; what it printed."""
     printed = ""
     if block.language == "python":
-        done = call([sys.executable, "-c", block.text], folder)
+        done = call([sys.executable, "-c", block.text], reader.folder)
         assert done.returncode == 0, done.stderr
         printed = done.stdout
     elif block.language == "sh":
         for line in block.commands():
-            done = escape(line, folder)
+            done = reader.escape(line)
             # Whether this computer can drive real devices is not for a test to say.
             allowed = (0, 1) if line.startswith("escape doctor") else (0,)
             assert done.returncode in allowed, f"{line}: {done.stderr}"
@@ -43,13 +43,13 @@ def run_block(block: Block, folder: Path) -> str:
 
 
 @pytest.mark.parametrize("page", RUN, ids=name_of)
-def test_a_page_can_be_followed(page: Path, tmp_path: Path) -> None:
-    printed = ""
+def test_a_page_can_be_followed(page: Path, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
+    reader, printed = Reader(tmp_path, tmp_path_factory), ""
     for block in blocks_of(page):
         if "printed" in block.marks:
             assert differences(block.text, printed) == []
         elif "slow" not in block.marks:
-            printed = run_block(block, tmp_path)
+            printed = run_block(block, reader)
 
 
 def test_a_quotation_is_compared_with_the_output() -> None:
@@ -62,12 +62,14 @@ def test_a_quotation_is_compared_with_the_output() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("page", RUN, ids=name_of)
-def test_a_page_can_be_followed_to_its_end(page: Path, tmp_path: Path) -> None:
-    blocks = blocks_of(page)
+def test_a_page_can_be_followed_to_its_end(
+    page: Path, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    blocks, reader = blocks_of(page), Reader(tmp_path, tmp_path_factory)
     if not any("slow" in block.marks for block in blocks):
         pytest.skip("holds nothing that takes long")
     for block in blocks:
-        run_block(block, tmp_path)
+        run_block(block, reader)
 
 
 @pytest.mark.parametrize("page", EVERY, ids=name_of)

@@ -6,6 +6,7 @@ Its influence functions are rounded exponentials and its slopes have no tip and 
 from __future__ import annotations
 
 import os
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -18,13 +19,18 @@ from escape_hw.calibration.sprint.fit import SprintFit
 SHARED = Path(os.environ.get("ESCAPE_SHARED_DATA", Path(__file__).parents[3] / "shared" / "data"))
 FOLDER = SHARED / "dm97"
 #: One date for each of the three masks.
-DATES = ("20230901150923", "20231214151118", "20231219151519")
+DATES = ("20230901151403", "20231214151118", "20231219151519")
 
-pytestmark = pytest.mark.skipif(
-    not (FOLDER / "dm97.json").is_file(), reason=f"no measured matrices in {FOLDER} (ESCAPE_SHARED_DATA)"
-)
+pytestmark = [
+    # Several tests read the same fits.
+    pytest.mark.xdist_group("dm97"),
+    pytest.mark.skipif(
+        not (FOLDER / "dm97.json").is_file(), reason=f"no measured matrices in {FOLDER} (ESCAPE_SHARED_DATA)"
+    ),
+]
 
 
+@cache
 def fitted(date: str) -> tuple[InteractionMatrix, SprintFit]:
     """The matrix of a date and SPRINT's fit to it."""
     matrix = read_matrix(FOLDER, date)
@@ -41,7 +47,7 @@ def test_the_fit_of_a_measured_mirror_converges(date: str) -> None:
 
 
 def test_matrices_minutes_apart_agree() -> None:
-    (_, a), (second, b) = fitted("20230901151403"), fitted("20230901151656")
+    (_, a), (second, b) = fitted(DATES[0]), fitted("20230901151656")
     difference = a.estimate.registration.to_array() - b.estimate.registration.to_array()
     # In % of a sub-aperture, degrees and % of the diameter: less than the uncertainty of the registration.
     assert (np.abs(difference) < [1.0, 1.0, 0.02, 0.15, 0.15]).all()

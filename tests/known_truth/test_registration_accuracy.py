@@ -67,6 +67,8 @@ def test_no_error_and_no_stated_error_is_below_the_bound(few: Sequence[Realisati
 
 
 @pytest.mark.slow
+# 330,000 frames and 120 fits: more than 20 minutes of processor time, in two processes.
+@pytest.mark.timeout(2400)
 def test_thirty_registrations_short_and_two_seconds() -> None:
     """The paper's SHORT run and a tenth of it: accurate, with correct errors of every parameter."""
     curves = run(sky_time(SYSTEM, realisations=30, frames=(1000, 10_000)))

@@ -51,14 +51,16 @@ _SAFETY_TIMEOUT_S = 5.0
 _HEARTBEAT_S = 1.0
 
 
-def silence_limit_s(state: State, limits: ServerSection) -> float:
-    """Seconds that an engine may be silent after this state.
+def silence_limit_s(state: State, engine_pid: int, limits: ServerSection) -> float:
+    """Seconds that an engine may be silent when this is the last published state.
 
-    A run may have moved the mirror since its last state: an engine that hangs then is not idle. Compilation on
-    a busy computer may delay an idle engine, which is harmless.
+    An engine that hangs in a run is not idle: it may have moved the mirror since its last state. The state of
+    an earlier engine says nothing about one that starts. Compilation on a busy computer may delay an idle
+    engine, which is harmless.
     """
+    starts = state.engine_pid != engine_pid
     idle = state.active_run is None and not state.loop.closed and state.mirror.peak == 0
-    return IDLE_SILENCE_LIMIT_S if idle else limits.engine_silence_s
+    return IDLE_SILENCE_LIMIT_S if starts or idle else limits.engine_silence_s
 
 
 _RESTART_REMEDY = "Read the log, then clear the fault to start the engine again."
@@ -179,7 +181,7 @@ class EngineSupervisor:
         if due:
             engine.maintain_failsafe(failsafe_is_running)
         state = self._published.state
-        limit = silence_limit_s(state, self._limits)
+        limit = silence_limit_s(state, engine.process.pid, self._limits)
         silence = now - engine.last_message_s
         if silence > limit:
             self._kill(engine, f"the engine was silent for {silence:.1f} s (limit {limit:g} s)")
