@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from forked import run_forked
 from shared_products import make_once
 
 ROOT = Path(__file__).parents[2]
@@ -46,8 +45,6 @@ def blocks_of(page: Path) -> list[Block]:
 def call(words: list[str], folder: Path) -> subprocess.CompletedProcess[str]:
     """Run a program in a folder that is also where the user's data go."""
     environment = {**os.environ, "PYTHONIOENCODING": "utf-8", "XDG_DATA_HOME": str(folder / "data")}
-    if words[0] in ("escape", sys.executable) and "-m" not in words:
-        return run_forked(words, folder, environment)
     return subprocess.run(
         words, cwd=folder, capture_output=True, text=True, timeout=600, check=False, env=environment
     )
@@ -55,7 +52,8 @@ def call(words: list[str], folder: Path) -> subprocess.CompletedProcess[str]:
 
 def escape(line: str, folder: Path) -> subprocess.CompletedProcess[str]:
     """Run a line of the command line."""
-    return call(line.split(), folder)
+    program = [sys.executable, "-c", "from escape_hw.cli import main; main()"]
+    return call([*program, *line.split()[1:]], folder)
 
 
 class Reader:

@@ -35,6 +35,10 @@ from escape_hw.pipeline.statistics import MIN_SAMPLES
 
 #: Poke of the first closure and the first round, and its factor from round to round.
 _FIRST_POKE, _POKE_FACTOR = 0.004, 0.5
+#: Largest relative loss of Strehl ratio due to the pokes before the last ones. Larger pokes, of many modes at
+#: once, dominate the residual: the gains of a pyramid are then those for the pokes, and the loop appears not
+#: to close.
+_EARLY_STREHL_LOSS = 0.2
 #: Frames per mode at each gain of the first closure, and their minimum.
 _FRAMES_PER_MODE, _MIN_FRAMES = 4, 400
 #: Accuracy of the rounds before the last poke, relative to the final one.
@@ -170,7 +174,7 @@ class _Bootstrap:
     def close_and_scale_loop(self, poke: float) -> Procedure[None]:
         """Close the loop at the effective gain, and scale its matrix by the measured gains."""
         loop = self._loop
-        amplitude = compute_poke_amplitudes(loop.bench, loop.reference.m2c, max(poke, _FIRST_POKE))
+        amplitude = self._limited_amplitude(max(poke, _FIRST_POKE), _EARLY_STREHL_LOSS)
         closure = yield from bootstrap_loop(loop, self._gain, amplitude, self._min_frames, self._steps)
         yield self._apply_gains(_smooth(closure.gains))
 
@@ -184,9 +188,8 @@ class _Bootstrap:
         loop, poke, repeats = self._loop, max(last_poke, _FIRST_POKE), 0
         while repeats < _MAX_LAST_ROUNDS and not self._converged:
             is_last_poke = poke <= last_poke
-            amplitude = compute_poke_amplitudes(loop.bench, loop.reference.m2c, poke)
-            if is_last_poke:
-                amplitude = scale_to_strehl_budget(amplitude, allowed_strehl_loss, *self._strehl_cost())
+            allowed = allowed_strehl_loss if is_last_poke else _EARLY_STREHL_LOSS
+            amplitude = self._limited_amplitude(poke, allowed)
             self._largest_amplitude = float(amplitude.max())
             accuracy = last_accuracy * (1 if is_last_poke else _EARLY_ACCURACY_FACTOR)
             segment = yield from loop.measure(
@@ -203,6 +206,11 @@ class _Bootstrap:
             self._converged = is_last_poke and is_confirmed
             repeats += is_last_poke
             poke = max(last_poke, poke * _POKE_FACTOR)
+
+    def _limited_amplitude(self, poke: float, allowed_strehl_loss: float) -> NDArray[np.float64]:
+        """Amplitudes of the modes ``(n_modes,)`` for a poke, reduced to an allowed loss of Strehl ratio."""
+        amplitude = compute_poke_amplitudes(self._loop.bench, self._loop.reference.m2c, poke)
+        return scale_to_strehl_budget(amplitude, allowed_strehl_loss, *self._strehl_cost())
 
     def _lower_gain(self, segment: LoopSegment) -> None:
         """Open an unstable loop and reduce its gain; raises after :data:`_MAX_RETRIES` reductions."""
