@@ -41,8 +41,8 @@ MUTATIONS = {
         "np.exp(2j * np.angle(responses))", "tests/known_truth/test_demodulation.py::test_delay_over_seeds",
     ),
     "lag of DO-CRIME": (
-        "escape_hw/calibration/docrime/whitening.py", "weight * values[at - lag]",
-        "weight * values[at - lag - 1]", "tests/known_truth/test_docrime_estimator.py",
+        "escape_hw/calibration/docrime/response.py", "rows[now[0] - lag : now[-1] - lag + 1]",
+        "rows[now[0] - lag - 1 : now[-1] - lag]", "tests/known_truth/test_docrime_estimator.py",
     ),
     "limit of the watchdog": (
         "escape_hw/server/safety/watchdog.py", "if silent <= limit:", "if silent <= 100 * limit:",

@@ -1,0 +1,81 @@
+"""Programs and libraries of the system that optional tests need: which are missing, and how to get them.
+
+``python tests/system_packages.py [--install]``. Installs with apt if it runs as root and apt works; otherwise
+it says what to type. The tests that need what is missing are skipped, so its exit code is always 0.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+
+def can_load(*names: str) -> bool:
+    """Whether all these libraries can be loaded."""
+    try:
+        for name in names:
+            ctypes.CDLL(name)
+    except OSError:
+        return False
+    return True
+
+
+def has_postgres() -> bool:
+    """Whether a PostgreSQL server can be started, also one outside ``PATH``."""
+    return bool(shutil.which("initdb") or list(Path("/usr/lib/postgresql").glob("*/bin/initdb")))
+
+
+QT = ("libEGL.so.1", "libGL.so.1", "libxkbcommon.so.0", "libfontconfig.so.1", "libdbus-1.so.3")
+QT_PACKAGES = ("libegl1", "libgl1", "libxkbcommon0", "libfontconfig1", "libdbus-1-3")
+#: What the tests need, how to look for it, and the packages of Debian that bring it.
+NEEDED: tuple[tuple[str, Callable[[], object], tuple[str, ...]], ...] = (
+    (
+        "a C compiler, for the stand-ins of vendors' libraries",
+        lambda: shutil.which("cc"),
+        ("gcc", "libc6-dev"),
+    ),
+    ("PostgreSQL, for sweeps of several computers", has_postgres, ("postgresql",)),
+    ("Aravis with its fake camera", lambda: can_load("libaravis-0.8.so.0"), ("libaravis-0.8-0",)),
+    ("libraries that Qt loads, for the window", lambda: can_load(*QT), QT_PACKAGES),
+    ("setpriv, to run commands as another user", lambda: shutil.which("setpriv"), ("util-linux",)),
+)
+
+
+def install(packages: list[str]) -> bool:
+    """Install with apt; false if that is not possible."""
+    apt = shutil.which("apt-get")
+    if os.geteuid() != 0 or apt is None:
+        return False
+    environment = {**os.environ, "DEBIAN_FRONTEND": "noninteractive"}
+    for words in (["update"], ["install", "--yes", "--no-install-recommends", *packages]):
+        try:
+            done = subprocess.run([apt, "--quiet", *words], env=environment, timeout=600, check=False)
+        except subprocess.TimeoutExpired:
+            return False
+        if done.returncode:
+            return False
+    return True
+
+
+def main() -> None:
+    """Say what is missing, and install it if asked to."""
+    missing = [(what, packages) for what, is_there, packages in NEEDED if not is_there()]
+    names = [name for _, packages in missing for name in packages]
+    for what, packages in missing:
+        print(f"missing: {what} ({' '.join(packages)})")
+    if names and "--install" in sys.argv[1:] and install(names):
+        missing = [(what, packages) for what, is_there, packages in NEEDED if not is_there()]
+        names = [name for _, packages in missing for name in packages]
+    if names:
+        print(f"tests that need these are skipped; as root: apt-get install {' '.join(names)}")
+    else:
+        print("all programs and libraries of the system that tests need are there")
+
+
+if __name__ == "__main__":
+    main()
