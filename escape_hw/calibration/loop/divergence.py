@@ -2,8 +2,8 @@
 
 ``runner`` checks the mirror's limits in every loop, ``operation`` the residual of a loop that runs until it
 is opened, ``tracking.tracker`` that of a tracked one, ``performance`` that of a finished run, and
-``optical_gain.bootstrap`` that of a segment. The watchdog of a server (``escape_hw.server.safety``) checks the
-published state by the same limits.
+``optical_gain.bootstrap`` that of a segment. The watchdog of a server
+(``escape_hw.server.safety``) checks the published state by the same limits.
 """
 
 from __future__ import annotations
