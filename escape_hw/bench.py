@@ -1,4 +1,4 @@
-"""The devices of a system, opened and closed together."""
+"""The devices of a system, opened and closed together; each is its twin or its driver, by ``mode``."""
 
 from __future__ import annotations
 
