@@ -77,7 +77,7 @@ def _section(path: str, entry: dict[str, Any], known: dict[str, Any]) -> Iterato
             for key, value in plain:
                 default = "" if key in required or "default" not in value else f"`{_toml(value['default'])}`"
                 text = str(value.get("description", "")).replace("|", "\\|").replace("*", "\\*")
-                yield f"| `{key}` | {default} | {_allowed(value)} | {text} |"
+                yield f"| `{key}` | {default} | {_format_choices(value)} | {text} |"
         for key, value in nested:
             yield from _section(f"{path}.{key}", value, known)
 
@@ -94,7 +94,7 @@ def _objects(entry: dict[str, Any], known: dict[str, Any]) -> Iterator[tuple[str
             )
 
 
-def _allowed(value: dict[str, Any]) -> str:
+def _format_choices(value: dict[str, Any]) -> str:
     options = value.get("anyOf", [value])
     parts = []
     for one in options:

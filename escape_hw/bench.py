@@ -1,4 +1,4 @@
-"""The devices of a system, opened and closed together."""
+"""The devices of a system, opened and closed together; each is its twin or its driver, by ``mode``."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from escape_hw.deprecation import renamed_members
 from escape_hw.errors import ConfigError
 
 if TYPE_CHECKING:
-    from threadpoolctl import threadpool_limits
+    from threadpoolctl import _ThreadpoolLimiter
 
 log = logging.getLogger(__name__)
 
@@ -74,7 +74,7 @@ class Bench:
         self.dark: NDArray[np.float32] | None = None
         self.flat: NDArray[np.float32] | None = None
         self._callbacks = Callbacks()
-        self._threads: threadpool_limits | None = None
+        self._threads: _ThreadpoolLimiter | None = None
         stream = zlib.crc32(b"escape_hw.bench")
         self.rng = np.random.default_rng(np.random.SeedSequence(config.system.seed, spawn_key=(stream,)))
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import functools
+import sys
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from threadpoolctl import threadpool_limits
+    from threadpoolctl import ThreadpoolController, _ThreadpoolLimiter
 
 
 class SignalSafeFlag:
@@ -46,7 +48,15 @@ def helper_threads_allowed() -> bool:
     return _helper_threads_allowed
 
 
-def limit_to_one_thread() -> threadpool_limits:
+@functools.lru_cache(maxsize=1)
+def _linear_algebra_libraries(n_modules: int) -> ThreadpoolController:
+    """The loaded libraries. The search takes milliseconds; it is repeated when modules were imported."""
+    from threadpoolctl import ThreadpoolController
+
+    return ThreadpoolController()
+
+
+def limit_to_one_thread() -> _ThreadpoolLimiter:
     """Limit the linear-algebra libraries to one thread.
 
     Small matrix products are slower on several threads, up to a hundred times when spinning thread pools
@@ -54,9 +64,7 @@ def limit_to_one_thread() -> threadpool_limits:
 
     Returns
     -------
-    threadpool_limits
+    _ThreadpoolLimiter
         Context manager; its ``restore_original_limits`` removes the limit.
     """
-    from threadpoolctl import threadpool_limits
-
-    return threadpool_limits(limits=1)
+    return _linear_algebra_libraries(len(sys.modules)).limit(limits=1)

@@ -300,9 +300,9 @@ class CommandContext:
 
         self._require_not_served(selection)
         system = open_system(selection.system, set=selection.set, seed=selection.seed, mode=selection.mode)
-        return self.opened(system)
+        return self.open_protected(system)
 
-    def opened(self, device: AbstractContextManager[T]) -> AbstractContextManager[T]:
+    def open_protected(self, device: AbstractContextManager[T]) -> AbstractContextManager[T]:
         """Open a device or system, and close it at the end; a Ctrl-C does not interrupt the closing."""
         self.devices_opened = True
         return self.interrupts.protect_closing(device)

@@ -19,7 +19,7 @@ from escape_hw.config.system import SystemConfig
 KeyPath = tuple[str | int, ...]
 
 
-def dotted(path: Sequence[str | int]) -> str:
+def format_path(path: Sequence[str | int]) -> str:
     """A path as text, ``devices.screen.screens_r0_m[2]``."""
     text = ""
     for step in path:
@@ -129,12 +129,12 @@ def closest_key(path: Sequence[str | int]) -> str | None:
     neighbours = [name for holder in place.candidate_sections for name in fields_of(holder)]
     neighbour = closest_match(str(path[min(depth, len(path) - 1)]), neighbours)
     if neighbour is not None:
-        return dotted((*place.existing, neighbour, *path[depth + 1 :]))
+        return format_path((*place.existing, neighbour, *path[depth + 1 :]))
     elsewhere = [key for key in all_keys() if key.rpartition(".")[2] == str(path[-1])]
     # Prefer the least nested keys: usually one section name is missing.
     levels = min((key.count(".") for key in elsewhere), default=0)
     elsewhere = [key for key in elsewhere if key.count(".") == levels]
-    return closest_match(dotted(path), elsewhere or all_keys()) or (elsewhere[0] if elsewhere else None)
+    return closest_match(format_path(path), elsewhere or all_keys()) or (elsewhere[0] if elsewhere else None)
 
 
 def range_text(field: FieldInfo, item: int | None = None) -> str:

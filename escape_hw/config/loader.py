@@ -57,7 +57,7 @@ class ConfigProblem:
     def line(self, where: str) -> str:
         """The problem on one line that begins with its place, for example ``file:line``."""
         value = "" if self.value is None else f" {format_short(self.value)}"
-        return f"{where}  {key_tree.dotted(self.path)}:{value}  {self.message}"
+        return f"{where}  {key_tree.format_path(self.path)}:{value}  {self.message}"
 
 
 def unknown_key_problem(path: Sequence[str | int], value: Any) -> ConfigProblem:

@@ -245,7 +245,7 @@ class SystemConfig(Section):
 
     @model_validator(mode="before")
     @classmethod
-    def _derived(cls, document: Any) -> Any:
+    def _derive_keys(cls, document: Any) -> Any:
         """Fill in keys that follow from others."""
         return derive_tilt_scale(document)
 

@@ -1,1 +1,4 @@
-"""Clients of a server: connection, requests, state documents, addresses, keys."""
+"""Clients of a server: connection, requests, state documents, addresses, keys.
+
+The server is in ``escape_hw.server``.
+"""

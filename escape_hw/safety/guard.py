@@ -119,7 +119,7 @@ class CommandGuard:
         """
         # Raise CommandRejected even where the caller lets numpy raise on overflow.
         with np.errstate(all="ignore"):
-            return self._validated(command)
+            return self._validate(command)
 
     def limit(self, command: ArrayLike) -> tuple[NDArray[np.float64], GuardReport]:
         """Limit a command so that it obeys every rule. Does not change the last shape.
@@ -137,7 +137,7 @@ class CommandGuard:
             See :meth:`validate`.
         """
         with np.errstate(all="ignore"):
-            requested = self._validated(command)
+            requested = self._validate(command)
             if self.is_legal(requested):
                 return _read_only(requested), _UNCHANGED
             legal, clipped, disabled, scale, removed = self._apply_static_limits(requested)
@@ -218,7 +218,7 @@ class CommandGuard:
         stroke_scale = min(1.0, self.limits.max_stroke / peak) if peak > 0 else 1.0
         return stroke_scale * self._scale(requested * stroke_scale)
 
-    def _validated(self, command: ArrayLike) -> NDArray[np.float64]:
+    def _validate(self, command: ArrayLike) -> NDArray[np.float64]:
         array = self._as_array(command)
         if array.dtype.kind not in "fiu":
             raise CommandRejected(

@@ -1,4 +1,8 @@
-"""Rings of arrays in shared memory: one writer, any number of readers, no waiting."""
+"""Rings of arrays in shared memory: one writer, any number of readers, no waiting.
+
+A torn read, of an entry that the writer overwrites meanwhile, is detected by the entry's counter and
+repeated.
+"""
 
 from __future__ import annotations
 

@@ -42,6 +42,7 @@ def test_python_blocks_run(number: int, tmp_path: Path) -> None:
         assert re.search(r"Strehl ratio: 0\.\d+ ± 0\.\d+", done.stdout)
 
 
+@pytest.mark.timeout(1500)
 def test_commands_run_in_the_order_they_stand(
     tmp_path: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> None:

@@ -31,7 +31,7 @@ def faulty(
 
 
 def dead(bench: System, *actuators: int) -> None:
-    """Make actuators take commands and not move, which nobody knows."""
+    """Make actuators take commands and not move, unknown to the configuration."""
     real = bench.dm._send
 
     def send(command: np.ndarray) -> None:
@@ -43,7 +43,7 @@ def dead(bench: System, *actuators: int) -> None:
 
 
 def settled_shape(bench: System) -> np.ndarray:
-    """Where the twin's actuators really go, whatever anybody believes about it: ``(n_act,)``."""
+    """Where the twin's actuators really go, whatever the configuration says: ``(n_act,)``."""
     twin = getattr(bench.dm, "inner", bench.dm)._bench
     dynamics = twin.dynamics
     dynamics.mean(dynamics._time, max(twin.now_s, dynamics._time) + 1.0)

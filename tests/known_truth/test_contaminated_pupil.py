@@ -87,6 +87,6 @@ def test_a_contaminated_rim_shifts_its_circle_and_the_error_includes_it() -> Non
 def test_a_clean_rim_is_round() -> None:
     rng = np.random.default_rng(3)
     whole = frame(NOMINAL, rng, 0.0, noise=0.002).astype(float)
-    soiled = frame(NOMINAL, np.random.default_rng(3), 0.03, noise=0.002).astype(float)
+    contaminated = frame(NOMINAL, np.random.default_rng(3), 0.03, noise=0.002).astype(float)
     assert estimate_roundness_error(whole, NOMINAL, N / 2, N / 2) < 0.02
-    assert estimate_roundness_error(soiled, NOMINAL, N / 2, N / 2) > 0.04
+    assert estimate_roundness_error(contaminated, NOMINAL, N / 2, N / 2) > 0.04

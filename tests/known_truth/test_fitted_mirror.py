@@ -97,8 +97,8 @@ def compared(design: Design, noise: float, m2c: np.ndarray | None = None) -> np.
 
 
 def test_a_well_measured_mirror_is_recovered(design: Design) -> None:
-    found, alike = compared(design, 0.1).T
-    assert (found < 0.25 * alike).all()
+    found, nominal = compared(design, 0.1).T
+    assert (found < 0.25 * nominal).all()
 
 
 def test_a_mirror_with_a_large_pedestal_is_recovered(design: Design) -> None:
@@ -115,17 +115,17 @@ def test_a_mirror_with_a_large_pedestal_is_recovered(design: Design) -> None:
 
 
 def test_a_poorly_measured_mirror_is_not_changed(design: Design) -> None:
-    """Noise of three times the elements' rms: single actuators cannot be told."""
-    found, alike = compared(design, 3.0).T
-    assert found.mean() < 1.05 * alike.mean()
-    assert (found < 1.2 * alike).all()
+    """Noise of three times the elements' rms: single actuators cannot be distinguished."""
+    found, nominal = compared(design, 3.0).T
+    assert found.mean() < 1.05 * nominal.mean()
+    assert (found < 1.2 * nominal).all()
 
 
 def test_the_matrix_holds_for_modes_that_were_never_poked(design: Design) -> None:
     other = np.random.default_rng(1).standard_normal((design.model.n_act, 12))
     # Single actuators are poked alone by no mode of the calibration.
-    found, alike = compared(design, 0.1, other).T
-    assert (found < 0.6 * alike).all()
+    found, nominal = compared(design, 0.1, other).T
+    assert (found < 0.6 * nominal).all()
 
 
 def test_corrections_belong_to_actuators_and_not_to_modes(design: Design) -> None:
@@ -155,13 +155,13 @@ def test_its_errors_include_single_actuators(design: Design) -> None:
 def test_nominal_is_the_matrix_of_the_nominal_mirror(design: Design) -> None:
     matrix = measured(design, injected(design, 0), 0.1, 0)
     found = sprint(matrix, design.model)
-    alike = sprint(matrix, design.model, actuator_model="nominal")
+    nominal = sprint(matrix, design.model, actuator_model="nominal")
     assert found.actuator_corrections is not None
-    assert alike.actuator_corrections is None
-    np.testing.assert_array_equal(alike.registration.to_array(), found.registration.to_array())
-    made = compute_pseudo_synthetic_matrix(design.model, alike, design.m2c)[0]
-    drawn = design.model.zonal_matrix(alike.registration, alike.width.value) @ design.m2c
-    np.testing.assert_allclose(made, alike.gain.value * drawn, atol=1e-4 * np.abs(made).max())
+    assert nominal.actuator_corrections is None
+    np.testing.assert_array_equal(nominal.registration.to_array(), found.registration.to_array())
+    made = compute_pseudo_synthetic_matrix(design.model, nominal, design.m2c)[0]
+    drawn = design.model.zonal_matrix(nominal.registration, nominal.width.value) @ design.m2c
+    np.testing.assert_allclose(made, nominal.gain.value * drawn, atol=1e-4 * np.abs(made).max())
 
 
 @pytest.mark.parametrize("frames", [50, 400])
@@ -175,7 +175,7 @@ def test_a_tenth_of_a_second_determines_unequal_actuators(frames: int) -> None:
             estimate = result.registration
             assert estimate is not None
             drawn = replace(estimate, actuator_corrections=None)
-            alike = compute_pseudo_synthetic_matrix(bench.model(result.grid), drawn, result.matrix.m2c)[0]
-            errors.append([missed(result.matrix.data.astype(float), exact), missed(alike, exact)])
-    found, alike_error = np.array(errors).T
-    assert (found < 0.85 * alike_error).all()
+            nominal = compute_pseudo_synthetic_matrix(bench.model(result.grid), drawn, result.matrix.m2c)[0]
+            errors.append([missed(result.matrix.data.astype(float), exact), missed(nominal, exact)])
+    found, nominal_error = np.array(errors).T
+    assert (found < 0.85 * nominal_error).all()

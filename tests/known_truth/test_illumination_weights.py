@@ -24,8 +24,8 @@ NOISE = 0.05
 class Selective:
     """The same model with a weight per slope."""
 
-    def __init__(self, model: PyramidModel, trust: NDArray[np.float64]) -> None:
-        self._model, self.slope_weights = model, trust
+    def __init__(self, model: PyramidModel, weights: NDArray[np.float64]) -> None:
+        self._model, self.slope_weights = model, weights
 
     def __getattr__(self, name: str) -> object:
         return getattr(self._model, name)
@@ -42,7 +42,7 @@ def errors(selective: bool, solver: Solver = "mixed-effects") -> NDArray[np.floa
     config = small_pyramid()
     pupils = nominal_pupils(config)
     model, dirty = PyramidModel(config, pupils), np.tile(contaminated(pupils), 2)
-    trust = np.where(dirty, 1e-3, 1.0)
+    weights = np.where(dirty, 1e-3, 1.0)
     out = []
     for seed in range(6):
         rng = np.random.default_rng(seed)
@@ -57,7 +57,7 @@ def errors(selective: bool, solver: Solver = "mixed-effects") -> NDArray[np.floa
             np.full(zonal.shape, noise, np.float32), np.eye(model.n_act), pupils.valid,
             "small", "push-pull", True,
         )  # fmt: skip
-        found = sprint(matrix, Selective(model, trust) if selective else model, solver=solver)
+        found = sprint(matrix, Selective(model, weights) if selective else model, solver=solver)
         # With all slopes the solvers without random effects state that the model does not fit.
         assert found.converged or not selective
         out.append(found.registration.to_array() - truth.to_array())

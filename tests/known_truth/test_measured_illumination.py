@@ -19,7 +19,7 @@ from escape_sim.optics.pupil import (
 )
 from escape_sim.optics.pyramid import PyramidOptics
 
-SOILED = ("twin.contamination.edge_share=0.28", "twin.contamination.unevenness=0.06")
+CONTAMINATED = ("twin.contamination.edge_share=0.28", "twin.contamination.unevenness=0.06")
 
 
 def seen(amplitude: NDArray[np.float32], offsets: NDArray[np.float64]) -> PyramidPupils:
@@ -37,7 +37,7 @@ def seen(amplitude: NDArray[np.float32], offsets: NDArray[np.float64]) -> Pyrami
 
 
 def test_a_contaminated_arc_is_dark_in_the_model() -> None:
-    config = load_system("maps-nir", overrides=SOILED)
+    config = load_system("maps-nir", overrides=CONTAMINATED)
     contaminated, design = contaminated_pupil(config, np.random.default_rng(3)), pupil_geometry(config)
     offsets = np.array([[0.3, -0.35], [-0.4, 0.2], [0.25, 0.4], [-0.2, -0.2]])
     found = apply_measured_illumination(design, seen(contaminated.amplitude, offsets))

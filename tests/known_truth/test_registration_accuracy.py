@@ -62,8 +62,8 @@ def test_no_error_is_beyond_what_its_sigma_allows(few: Sequence[RealisationError
 
 
 def test_no_error_and_no_stated_error_is_below_the_bound(few: Sequence[RealisationErrors]) -> None:
-    for plant in few:
-        assert (plant.sigmas[1, 0] > plant.exact[0]).all()
+    for realisation in few:
+        assert (realisation.sigmas[1, 0] > realisation.exact[0]).all()
 
 
 @pytest.mark.slow

@@ -11,7 +11,7 @@ from escape_hw.api.camera import Frame
 from escape_hw.errors import CalibrationError
 from escape_hw.pipeline.psf.strehl import (
     centre_image,
-    encircled,
+    compute_encircled_energy,
     find_peak,
     is_peak_saturated,
     strehl,
@@ -142,7 +142,7 @@ def test_the_image_is_centred(plane):
 def test_encircled_energy_of_a_uniform_image_is_the_circles_area():
     image = np.full((41, 41), 1.0)
     for radius in (3.0, 5.5, 9.0):
-        assert encircled(image, radius) == pytest.approx(np.pi * radius**2, rel=0.02)
+        assert compute_encircled_energy(image, radius) == pytest.approx(np.pi * radius**2, rel=0.02)
 
 
 def test_encircled_energy_of_an_airy_pattern():
@@ -150,7 +150,7 @@ def test_encircled_energy_of_an_airy_pattern():
     airy = FocalPlane(pupil_amplitude(192), 192, WAVELENGTH, 10.0, (400, 400)).image(
         np.zeros((192, 192), np.float32)
     )
-    assert encircled(airy.astype(float), 12.2) == pytest.approx(0.838, abs=0.004)
+    assert compute_encircled_energy(airy.astype(float), 12.2) == pytest.approx(0.838, abs=0.004)
 
 
 def frames(plane, n: int, seed: int, noise: float = 0.0) -> NDArray[np.float64]:

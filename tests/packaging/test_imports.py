@@ -3,6 +3,8 @@
 import json
 import subprocess
 import sys
+import tomllib
+from pathlib import Path
 
 import pytest
 
@@ -45,3 +47,12 @@ def test_public_names_are_listed_and_load() -> None:
         assert getattr(escape_hw, name) is not None
     with pytest.raises(AttributeError, match="no attribute 'opne_system'"):
         escape_hw.opne_system  # noqa: B018
+
+
+@pytest.mark.parametrize("contract", ["core", "calibration"])
+def test_the_decision_on_the_layout_lists_the_layers_that_are_checked(contract: str) -> None:
+    root = Path(__file__).parents[2]
+    contracts = tomllib.loads((root / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"]
+    (layers,) = [one["layers"] for one in contracts if one["id"] == contract]
+    page = " ".join((root / "docs/decisions/0001-layout.md").read_text().split())
+    assert ", ".join(f"`{layer}`" for layer in layers) in page

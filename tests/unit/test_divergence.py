@@ -12,6 +12,7 @@ from escape_hw.calibration.loop.divergence import (
     BlockResidualMonitor,
     ResidualMonitor,
     SaturationMonitor,
+    is_above_stable,
     is_steady,
 )
 from escape_hw.config.system import ServerSection
@@ -91,3 +92,9 @@ def test_a_run_is_steady_unless_it_doubles_at_its_end():
     residual[2000:] *= 2.2
     assert not is_steady(residual)
     assert not is_steady(np.array([1.0, np.nan], np.float32))
+
+
+def test_a_segment_is_compared_with_the_stable_ones():
+    assert is_above_stable(160.0, [100.0, 90.0, np.nan])
+    assert not is_above_stable(140.0, [100.0, 90.0])
+    assert not is_above_stable(140.0, []), "nothing to compare with"

@@ -153,6 +153,14 @@ def test_nan_in_the_data_is_refused(tmp_path, small):
         load_matrix(path)
 
 
+def test_a_matrix_without_standard_errors_comes_back(tmp_path, small):
+    """A single push and pull of each mode gives none."""
+    sigma = np.full_like(small.matrix.sigma, np.nan)
+    result = dataclasses.replace(small, matrix=dataclasses.replace(small.matrix, sigma=sigma))
+    product = load_matrix(save_matrix(tmp_path / "im.fits", result))
+    assert np.isnan(product.matrix.sigma).all()
+
+
 def test_matrix_and_grid_must_belong_together(tmp_path, small):
     with pytest.raises(ValueError, match="sub-apertures"):
         save_matrix(tmp_path / "im.fits", dataclasses.replace(small, grid=fake.grid(5)))

@@ -13,7 +13,7 @@ _FILE = Path(__file__).parents[2] / "benchmarks" / "studies" / "realisation_tabl
 
 @pytest.fixture(scope="module")
 def tables():
-    spec = importlib.util.spec_from_file_location("plant_tables", _FILE)
+    spec = importlib.util.spec_from_file_location("realisation_tables", _FILE)
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module

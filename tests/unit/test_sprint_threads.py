@@ -1,4 +1,4 @@
-"""SPRINT limits the threads of the linear algebra while it computes, not while it is suspended."""
+"""Threads of the linear algebra; SPRINT limits them while it computes, not while it is suspended."""
 
 from __future__ import annotations
 
@@ -6,7 +6,9 @@ from contextlib import contextmanager
 
 import numpy as np
 import small_system
+import threadpoolctl
 
+from escape_hw.api.concurrency import limit_to_one_thread
 from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.registration import Registration
 from escape_hw.calibration.sprint import fit
@@ -38,3 +40,15 @@ def test_the_limit_does_not_hold_while_the_procedure_is_suspended(monkeypatch):
         assert entered == 0
         suspended += 1
     assert suspended > 1
+
+
+def test_the_libraries_are_searched_once(monkeypatch):
+    """The search takes milliseconds, and a fit sets the limit for every step."""
+    original, searches = threadpoolctl.ThreadpoolController, []
+    monkeypatch.setattr(threadpoolctl, "ThreadpoolController", lambda: searches.append(1) or original())
+    for _ in range(3):
+        with limit_to_one_thread():
+            pass
+    assert len(searches) <= 1
+    with limit_to_one_thread():
+        assert {one["num_threads"] for one in threadpoolctl.threadpool_info()} == {1}

@@ -13,25 +13,25 @@ from escape_hw.io.fits.telemetry import LoopTelemetry, load_telemetry, save_tele
 from escape_hw.runtime.procedures.loop_telemetry import LoopTelemetryRecorder
 
 
-def play(tape: LoopTelemetryRecorder, index: int, answer: float | None) -> None:
+def play(recorder: LoopTelemetryRecorder, index: int, answer: float | None) -> None:
     """A frame, its slopes, and the command that answers it."""
-    callbacks = tape.callbacks
+    callbacks = recorder.callbacks
     assert callbacks.frame is not None
     assert callbacks.slopes is not None
     assert callbacks.command is not None
     callbacks.frame(Frame(np.zeros((2, 2), np.uint16), index, index * 2_000_000, index * 2_000_000 + 5))
     buffer = np.full(4, index, np.float32)
     callbacks.slopes(index, buffer)
-    buffer[:] = -1  # what a tap gets is overwritten
+    buffer[:] = -1  # what a callback gets is overwritten
     if answer is not None:
         callbacks.command(np.full(3, answer))
 
 
 def test_the_newest_frames_are_kept_in_order() -> None:
-    tape = LoopTelemetryRecorder(5, 4, 3)
+    recorder = LoopTelemetryRecorder(5, 4, 3)
     for index in (1, 2, 4, 5, 6, 7, 9):
-        play(tape, index, index / 10)
-    found = tape.to_telemetry()
+        play(recorder, index, index / 10)
+    found = recorder.to_telemetry()
     assert found.index.tolist() == [4, 5, 6, 7, 9]
     np.testing.assert_array_equal(found.slopes[:, 0], found.index)
     np.testing.assert_allclose(found.commands[:, 2], found.index / 10)
@@ -40,35 +40,35 @@ def test_the_newest_frames_are_kept_in_order() -> None:
 
 
 def test_only_the_first_command_answers_a_frame() -> None:
-    tape = LoopTelemetryRecorder(5, 4, 3)
-    play(tape, 1, 0.1)
-    play(tape, 2, None)
-    play(tape, 3, 0.3)
-    assert tape.callbacks.command is not None
-    tape.callbacks.command(np.zeros(3))  # flattened at the end
-    assert tape.to_telemetry().commands[:, 0].tolist() == [0.1, 0.1, 0.3]
+    recorder = LoopTelemetryRecorder(5, 4, 3)
+    play(recorder, 1, 0.1)
+    play(recorder, 2, None)
+    play(recorder, 3, 0.3)
+    assert recorder.callbacks.command is not None
+    recorder.callbacks.command(np.zeros(3))  # flattened at the end
+    assert recorder.to_telemetry().commands[:, 0].tolist() == [0.1, 0.1, 0.3]
 
 
 def test_a_new_start_of_the_camera_begins_anew() -> None:
-    tape = LoopTelemetryRecorder(5, 4, 3)
+    recorder = LoopTelemetryRecorder(5, 4, 3)
     for index in (7, 8, 1, 2):
-        play(tape, index, 0.0)
-    assert tape.to_telemetry().index.tolist() == [1, 2]
+        play(recorder, index, 0.0)
+    assert recorder.to_telemetry().index.tolist() == [1, 2]
     assert LoopTelemetryRecorder(5, 4, 3).to_telemetry().rate_hz == 0
 
 
 def test_slopes_of_another_geometry_are_left_out() -> None:
-    tape = LoopTelemetryRecorder(5, 4, 3)
-    assert tape.callbacks.slopes is not None
-    tape.callbacks.slopes(1, np.zeros(6, np.float32))
-    assert tape.to_telemetry().index.size == 0
+    recorder = LoopTelemetryRecorder(5, 4, 3)
+    assert recorder.callbacks.slopes is not None
+    recorder.callbacks.slopes(1, np.zeros(6, np.float32))
+    assert recorder.to_telemetry().index.size == 0
 
 
 def test_telemetry_on_disk(tmp_path: Path) -> None:
-    tape = LoopTelemetryRecorder(5, 4, 3)
+    recorder = LoopTelemetryRecorder(5, 4, 3)
     for index in (1, 2, 4):
-        play(tape, index, index / 10)
-    record = tape.to_telemetry()
+        play(recorder, index, index / 10)
+    record = recorder.to_telemetry()
     back = load_telemetry(save_telemetry(tmp_path / "t.fits", record, "a", True))
     for name in ("index", "exposed_s", "slopes", "commands"):
         np.testing.assert_array_equal(getattr(back.result, name), getattr(record, name))

@@ -1,1 +1,4 @@
-"""Real calibration data: readers of folders that are next to the project, with their ``README.md``."""
+"""Real calibration data: readers of folders that are next to the project, with their ``README.md``.
+
+Scripts that evaluate the data are in benchmarks/studies.
+"""

@@ -1,1 +1,1 @@
-"""Benchmarks of the simulated optics against OOPAO."""
+"""Benchmarks of the simulated optics against OOPAO. Synthetic models are in ``calibration``."""

@@ -1,1 +1,1 @@
-"""Adapters to the packages that ESCAPE is compared with: pyRTC, OOPAO, SPECULA."""
+"""Adapters to the packages that ESCAPE is compared with: pyRTC, OOPAO, SPECULA. No measurements."""

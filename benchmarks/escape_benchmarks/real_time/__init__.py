@@ -1,1 +1,4 @@
-"""Benchmarks of the real-time pipeline: kernels, loop latency, cost of pokes in a running loop."""
+"""Benchmarks of the real-time pipeline: kernels, loop latency, cost of pokes in a running loop.
+
+The transfer to a single device is in ``drivers``.
+"""

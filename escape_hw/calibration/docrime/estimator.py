@@ -330,7 +330,7 @@ class DocrimeEstimator:
             return
         # Without a filter the differences of the first frames give the more accurate response.
         if self._tracker is not None and self.order:
-            before = self._sums.sampled().subtract_means()
+            before = self._sums.select_sampled().subtract_means()
             matrix = before.solve()
             self._tracker.add(block, matrix, before.signal_power(matrix))
         self._sums.add(block.slopes, block.excitation(fit.response.weights))

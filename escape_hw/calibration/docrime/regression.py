@@ -155,7 +155,7 @@ class RegressionSums:
             self.count,
         )
 
-    def sampled(self) -> Self:
+    def select_sampled(self) -> Self:
         """Return the sums for the sampled slopes alone, with their correlations."""
         step = sampling_step(self.slopes.size)
         return replace(self, cross=self.cross[::step], power=self.few, slopes=self.slopes[::step])
@@ -203,7 +203,7 @@ class RegressionSums:
     def sample(self, matrix: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """The sampled rows of the solved matrix, and the sum of their residuals times residuals."""
         rows = matrix[:: sampling_step(len(matrix))]
-        return rows, self.sampled().residual_power(rows)
+        return rows, self.select_sampled().residual_power(rows)
 
 
 class InstrumentalVariableSums(RegressionSums):

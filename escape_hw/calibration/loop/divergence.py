@@ -1,7 +1,9 @@
 """Rules that detect a diverging loop, and their limits.
 
 ``runner`` checks the mirror's limits in every loop, ``operation`` the residual of a loop that runs until it
-is opened, ``tracking.tracker`` the residual of a tracked one.
+is opened, ``tracking.tracker`` that of a tracked one, ``performance`` that of a finished run, and
+``optical_gain.bootstrap`` that of a segment. The watchdog of a server
+(``escape_hw.server.safety``) checks the published state by the same limits.
 """
 
 from __future__ import annotations
@@ -29,6 +31,8 @@ _MAX_SATURATED_FRAMES = 50
 #: Ratio of the residual to its usual value at which a loop with pokes diverges while the limits shorten more
 #: than this fraction of its commands.
 _LIMITED_FACTOR, _LIMITED_FRACTION = 2.0, 0.9
+#: Ratio of the residual of a segment to the largest of stable segments at which the loop is not stable.
+_SEGMENT_FACTOR = 1.5
 
 
 class SaturationMonitor:
@@ -118,6 +122,15 @@ def is_steady(residual: NDArray[np.float32]) -> bool:
         return bool(np.isfinite(residual).all())
     middle, last = np.median(residual[third : 2 * third]), np.median(residual[2 * third :])
     return bool(np.isfinite(residual).all() and last < _MAX_GROWTH_BETWEEN_THIRDS * middle)
+
+
+def is_above_stable(residual_nm: float, stable_nm: Sequence[float]) -> bool:
+    """Whether the residual of a segment is far above those of stable segments, in nm, if there are any.
+
+    The slopes of a pyramid saturate before the mirror does, so that the limits detect no divergence.
+    """
+    finite = [value for value in stable_nm if math.isfinite(value)]
+    return bool(finite) and residual_nm > _SEGMENT_FACTOR * max(finite)
 
 
 def require_not_diverged(diverged: bool, frames: int) -> None:

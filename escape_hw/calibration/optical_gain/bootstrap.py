@@ -24,6 +24,7 @@ from escape_hw.calibration.acquisition.pokes import (
     scale_to_strehl_budget,
     strehl_loss,
 )
+from escape_hw.calibration.loop.divergence import is_above_stable
 from escape_hw.calibration.optical_gain.estimator import GainMeasurementLoop, LoopSegment, OpticalGainEstimate
 from escape_hw.calibration.optical_gain.loop_closure import bootstrap_loop
 from escape_hw.calibration.optical_gain.matrix_comparison import scale_matrix
@@ -197,7 +198,8 @@ class _Bootstrap:
                 f"round {len(self._rounds) + 1}, poke {amplitude.max():.2g}", max_frames=max_frames,
                 is_sufficient=partial(_is_accurate, target=accuracy),
             )  # fmt: skip
-            if segment.diverged or segment.gains is None or self._residual_is_high(segment):
+            stable_nm = [step.residual_nm for step in self._steps if step.stable]
+            if segment.diverged or segment.gains is None or is_above_stable(segment.residual_nm, stable_nm):
                 self._lower_gain(segment)
                 continue
             last = self._record_round(segment, segment.gains, amplitude, accuracy)
@@ -225,14 +227,6 @@ class _Bootstrap:
         self._notes.append(f"the loop was not stable; its gain was lowered to {self._gain:.3g}")
         self._loop.open_loop()
         self._loop.control.set_gain(self._gain)
-
-    def _residual_is_high(self, segment: LoopSegment) -> bool:
-        """Whether the residual is far above those of the first closure.
-
-        The slopes of a pyramid saturate before the mirror does, so divergence is not detected by the limits.
-        """
-        known = [step.residual_nm for step in self._steps if step.stable and math.isfinite(step.residual_nm)]
-        return bool(known) and segment.residual_nm > 1.5 * max(known)
 
     def _record_round(
         self,

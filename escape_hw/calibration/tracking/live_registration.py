@@ -178,7 +178,7 @@ class LiveRegistration:
         """
         if self._updates < 2 or self._updates % _WHITEN_EVERY == 0:
             self._whiten(data, start)
-        block = self._filtered(data, start)
+        block = self._filter_block(data, start)
         self._weights.add(block, self._current_matrix)
         response = self._weights.response(self._response)
         delayed = block.excitation(response.weights)
@@ -211,14 +211,14 @@ class LiveRegistration:
         n_modes = self._template.n_modes
         if first and self._response is None:
             sums = ResponseAccumulator(self._lags)
-            sums.add(self._filtered(data, start), self._current_matrix)
+            sums.add(self._filter_block(data, start), self._current_matrix)
             self._response = sums.response(None)
         if self._order:
             response = self._weights.response(self._response)
             commands = AlignedTelemetry(data.rows[:, :-n_modes], data.present, data.n_slopes)
             self._whitener = fit_whitener(commands, self._current_matrix, response, self._order, self._lags)
 
-    def _filtered(self, data: AlignedTelemetry, start: int) -> FilteredTelemetry:
+    def _filter_block(self, data: AlignedTelemetry, start: int) -> FilteredTelemetry:
         if self._whitener is None:
             raise RuntimeError("the whitening filter has not been estimated")
         block = filter_telemetry(data, self._whitener, self._lags, start)

@@ -68,7 +68,7 @@ def clear(
             raise ConfigError("the fault was not cleared; fix its cause, then confirm with --yes")
     if previous.state == "fault":
         announce_change(context, config, "dm", f"clear the fault '{previous.fault}'")
-        with context.opened(mirror):
+        with context.open_protected(mirror):
             mirror.recover()
             after = mirror.health
     context.show(f"fault: {previous.fault or 'none'}; now {after.state}")
@@ -100,7 +100,7 @@ def _go_to_state(context: CommandContext, selection: options.SystemSelection, *,
     previous = mirror.observe_health().state
     announce_change(context, config, "dm", f"from {previous} to {requested}")
     mirror.leave_set = floating
-    with context.opened(mirror):
+    with context.open_protected(mirror):
         mirror.go_to(requested)
         health = mirror.health
     context.show(f"{previous} → {health.state}", *_format_health(health))

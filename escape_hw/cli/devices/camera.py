@@ -46,7 +46,7 @@ def snap(
     config, section, device = _camera(context, selection, camera)
     if out is not None and out.exists():
         raise ConfigError(f"{out}: exists; choose another name or remove it")
-    with context.opened(device):
+    with context.open_protected(device):
         settings, changed = _apply_configuration(context, config, camera, device)
         frame_list = context.run(grab_frames(device, frames, section.timeout_s))
         info, status = device.info, device.status()
@@ -80,7 +80,7 @@ def stream(
     from escape_hw.runtime.host.device_tools import monitor_camera
 
     config, section, device = _camera(context, selection, camera)
-    with context.opened(device):
+    with context.open_protected(device):
         settings, changed = _apply_configuration(context, config, camera, device)
         statistics = context.run(monitor_camera(device, seconds, section.timeout_s))
         info = device.info
@@ -119,7 +119,7 @@ def settings(
     requested = _requested_settings(section.settings(), exposure, rate, gain, region)
     if not check:
         announce_change(context, config, camera, "exposure, frame rate, gain and region")
-    with context.opened(device):
+    with context.open_protected(device):
         achievable = device.check(requested)
         now = achievable if check else device.configure(requested)
         info = device.info

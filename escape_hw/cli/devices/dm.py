@@ -30,7 +30,7 @@ def flat(context: CommandContext, selection: options.Selection) -> None:
     config, dm = _mirror(context, selection)
     announce_change(context, config, "dm", "ramp to flat")
     _preserve_floating(dm)
-    with context.opened(dm):
+    with context.open_protected(dm):
         dm.flatten()
         info, sent = dm.info, dm.sent_count
     context.show(f"{info.model} {info.serial}: flat after {sent} commands")
@@ -56,7 +56,7 @@ def poke(
         context, config, "dm", f"flat, then actuator {actuator} by {amplitude:g} for {seconds:g} s"
     )
     _preserve_floating(dm)
-    with context.opened(dm):
+    with context.open_protected(dm):
         dm.flatten()
         motion = context.run(hold_shape(dm, poke_shape(dm, actuator, amplitude), seconds))
         info = dm.info
@@ -81,7 +81,7 @@ def wave(
     config, dm = _mirror(context, selection)
     announce_change(context, config, "dm", f"a wave of {amplitude:g} at {frequency:g} Hz for {seconds:g} s")
     _preserve_floating(dm)
-    with context.opened(dm):
+    with context.open_protected(dm):
         dm.flatten()
         motion = context.run(run_wave(dm, wave_generator(dm, amplitude, waves), frequency, seconds))
         info = dm.info
@@ -110,7 +110,7 @@ def status(context: CommandContext, selection: options.Selection) -> None:
         context.show(f"{health.state}, gap {health.gap_m * 1e6:.1f} um {health.fault}".rstrip())
     else:
         announce_change(context, config, "dm", "it is opened, and flattened when it is closed")
-        with context.opened(dm):
+        with context.open_protected(dm):
             changed = True
     info, limits = dm.info, dm.limits
     context.show(

@@ -57,7 +57,7 @@ def start(
     announce_change(
         context, config, "modulator", "servos on, auto-zero where needed, centre, then the circle"
     )
-    with context.opened(device):
+    with context.open_protected(device):
         achievable = device.check(requested)
         context.notify(f"requested: {_format_modulation(requested, section)}")
         context.notify(f"achievable: {_format_modulation(achievable, section)}")
@@ -81,7 +81,7 @@ def stop(context: CommandContext, selection: options.Selection) -> None:
     """Stop and park: MOVES the stage to its centre, then switches its servos off."""
     config, section, device = _device(context, selection)
     announce_change(context, config, "modulator", "centre, servos off")
-    with context.opened(device):
+    with context.open_protected(device):
         device.park()
         status = device.status()
     context.show(*_format_status(status, section), "left parked")

@@ -170,7 +170,9 @@ def _unpack_matrix(
         metrics=extensions.unpack_metrics(path, hdus, f"{prefix}METRICS"),
         slope_unit=str(cards["BUNIT"]),
     )
-    for name, values, low in (("IM", matrix.data, -_LARGEST), ("SIGMA", matrix.sigma, 0.0)):
+    # A single measurement of each element has no standard error; it is NaN.
+    known_sigma = matrix.sigma[~np.isnan(matrix.sigma)]
+    for name, values, low in (("IM", matrix.data, -_LARGEST), ("SIGMA", known_sigma, 0.0)):
         fits_file.require_values(path, f"{prefix}{name}", values, low, _LARGEST)
     fits_file.require_values(path, "M2C", matrix.m2c, -_LARGEST, _LARGEST)
     return matrix

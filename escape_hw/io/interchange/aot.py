@@ -323,7 +323,7 @@ def read_aot(path: Path | str, stroke_m: float | None = None, loop: str = "") ->
             f"{path}: not an AOT file that aotpy reads ({type(error).__name__}: {error})"
         ) from error
     selected = _select_loop(path, aotpy, system, loop)
-    return _AotReader(path, aotpy, system, selected, stroke_m).content()
+    return _AotReader(path, aotpy, system, selected, stroke_m).read_content()
 
 
 def _select_loop(path: Path, aotpy: Any, system: Any, name: str) -> Any:
@@ -350,7 +350,7 @@ class _AotReader:
         # The numbers of the sub-apertures row by row, which is our order.
         self.order = numbers[self.valid].astype(np.intp)
 
-    def content(self) -> AotContent:
+    def read_content(self) -> AotContent:
         """Everything."""
         geometry = self._geometry()
         text = str(self.system.config or "").encode("ascii", "replace").decode("unicode_escape")

@@ -115,7 +115,7 @@ def _shift_image(image: NDArray[np.float64], shift: NDArray[np.float64]) -> NDAr
     return np.asarray(np.fft.ifft2(ndimage.fourier_shift(np.fft.fft2(image), shift)).real)
 
 
-def encircled(image: NDArray[np.float64], radius_px: float = RADIUS_PX) -> float:
+def compute_encircled_energy(image: NDArray[np.float64], radius_px: float = RADIUS_PX) -> float:
     """Fraction of a centred image's light within ``radius_px`` of its middle."""
     return float((image * _aperture(image.shape, radius_px)).sum())
 
@@ -147,7 +147,7 @@ def _ratio_weights(model: NDArray[np.float64]) -> NDArray[np.float64]:
     peak[middle] = 1 / model[middle]
     # A sum of a transfer function over frequencies is a weighted sum over the image.
     otf = np.fft.fftshift(np.fft.fft2(inside.astype(float)).real) / ideal[inside].sum()
-    circle = _aperture(model.shape, RADIUS_PX) / encircled(model)
+    circle = _aperture(model.shape, RADIUS_PX) / compute_encircled_energy(model)
     return np.stack([peak, otf, circle]).reshape(3, -1)
 
 

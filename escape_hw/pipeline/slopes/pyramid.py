@@ -29,7 +29,7 @@ def slopes_of_image(image: NDArray[Any], pupils: PyramidPupils) -> NDArray[np.fl
 
 
 @njit(inline="always")
-def _calibrated(frame, gain, offset, at):  # type: ignore[no-untyped-def]  # pragma: no cover
+def _calibrate_pixel(frame, gain, offset, at):  # type: ignore[no-untyped-def]  # pragma: no cover
     return np.float32(frame[at]) * gain[at] - offset[at]
 
 
@@ -50,10 +50,10 @@ def quad_cell_slopes(frame, gain, offset, corners, runs, zero_points, local, slo
         start, length, first = np.uint64(runs[r, 0]), np.uint64(runs[r, 1]), np.uint64(runs[r, 2])
         line = np.float32(0)
         for j in range(length):
-            ul = _calibrated(pixels, scale, cut, a + start + j)
-            ur = _calibrated(pixels, scale, cut, b + start + j)
-            ll = _calibrated(pixels, scale, cut, c + start + j)
-            lr = _calibrated(pixels, scale, cut, d + start + j)
+            ul = _calibrate_pixel(pixels, scale, cut, a + start + j)
+            ur = _calibrate_pixel(pixels, scale, cut, b + start + j)
+            ll = _calibrate_pixel(pixels, scale, cut, c + start + j)
+            lr = _calibrate_pixel(pixels, scale, cut, d + start + j)
             light = ul + ur + ll + lr
             slopes[first + j] = ur + lr - ul - ll
             slopes[np.uint64(n) + first + j] = ll + lr - ul - ur

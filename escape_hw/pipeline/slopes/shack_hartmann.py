@@ -47,7 +47,7 @@ def subaperture_windows(
 
 
 @njit(inline="always")
-def _calibrated(frame, gain, offset, at, pixel):  # type: ignore[no-untyped-def]  # pragma: no cover
+def _calibrate_pixel(frame, gain, offset, at, pixel):  # type: ignore[no-untyped-def]  # pragma: no cover
     value = np.float32(frame[at]) * gain[pixel] - offset[pixel]
     return value if value > np.float32(0) else np.float32(0)
 
@@ -87,10 +87,10 @@ def centres_of_gravity(frame, gain, offset, per_pixel, places, weights, zero_poi
             block = zero
             weighted_rows = zero
             for j in range(width):
-                v0 = _calibrated(pixels, scale, cut, at + j, per_pixel * at + j)
-                v1 = _calibrated(pixels, scale, cut, at1 + j, per_pixel * at1 + j)
-                v2 = _calibrated(pixels, scale, cut, at2 + j, per_pixel * at2 + j)
-                v3 = _calibrated(pixels, scale, cut, at3 + j, per_pixel * at3 + j)
+                v0 = _calibrate_pixel(pixels, scale, cut, at + j, per_pixel * at + j)
+                v1 = _calibrate_pixel(pixels, scale, cut, at1 + j, per_pixel * at1 + j)
+                v2 = _calibrate_pixel(pixels, scale, cut, at2 + j, per_pixel * at2 + j)
+                v3 = _calibrate_pixel(pixels, scale, cut, at3 + j, per_pixel * at3 + j)
                 column = v0 + v1 + v2 + v3
                 block += column * weight[mask_start + j]
                 first += column * weight[lever + j]
@@ -102,7 +102,7 @@ def centres_of_gravity(frame, gain, offset, per_pixel, places, weights, zero_poi
         while i < rows:
             line = zero
             for j in range(width):
-                value = _calibrated(pixels, scale, cut, at + j, per_pixel * at + j)
+                value = _calibrate_pixel(pixels, scale, cut, at + j, per_pixel * at + j)
                 line += value * weight[mask_start + j]
                 first += value * weight[lever + j]
             total += line

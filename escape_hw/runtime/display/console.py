@@ -10,7 +10,7 @@ from escape_hw.runtime.display.descriptors import redirect_to_null
 
 
 class DisplayConsole(Console):
-    """A console on standard error that raises ``BrokenPipeError`` when nobody reads it.
+    """A console on standard error that raises ``BrokenPipeError`` when its reader has gone.
 
     Rich would end the program and redirect its standard output.
     """

@@ -1,1 +1,4 @@
-"""Host computer and single devices: checks, discovery, udev rules, process pools, tools for one device."""
+"""Host computer and single devices: checks, discovery, udev rules, process pools, tools for one device.
+
+The open system with all its devices is in ``runtime.session``.
+"""

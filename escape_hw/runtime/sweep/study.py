@@ -71,7 +71,7 @@ class _Storage(optuna.storages.RDBStorage):
             super().record_heartbeat(trial_id)
 
 
-def _retried(
+def _retry_storage(
     method: Callable[Concatenate[SweepStudy, P], T],
 ) -> Callable[Concatenate[SweepStudy, P], T]:
     """The method, called again while the storage does not answer."""
@@ -133,7 +133,7 @@ class SweepStudy:
         self._stopped.set()
 
     # ------------------------------------------------------------------ run loops
-    @_retried
+    @_retry_storage
     def enqueue_missing(
         self, plan: Sequence[Slot], values: Mapping[tuple[str, int], Mapping[str, Any]], n_free: int
     ) -> tuple[int, int]:
@@ -240,7 +240,7 @@ class SweepStudy:
         trial.suggest_categorical("optical_gains", (False, True))
         return slot, {one.key: _suggest_value(trial, one) for one in self.sweep.space}
 
-    @_retried
+    @_retry_storage
     def ask(self) -> tuple[optuna.Trial, Slot, dict[str, Any]] | None:
         """Take the next trial of the queue, for a procedure that cannot run within :meth:`run_next`."""
         trial = self._study.ask()
@@ -250,7 +250,7 @@ class SweepStudy:
             self.tell(trial, None)
             return None
 
-    @_retried
+    @_retry_storage
     def tell(self, trial: optuna.Trial, outcome: dict[str, Any] | None, merit: float | None = None) -> None:
         """Store the outcome of a trial from :meth:`ask`; without one, its loop runs again.
 
@@ -272,7 +272,7 @@ class SweepStudy:
         self._study.tell(trial, merit, state=state, skip_if_finished=True)
 
     # ------------------------------------------------------------------ results
-    @_retried
+    @_retry_storage
     def records(self) -> list[TrialRecord]:
         """Every finished loop once, in the order of the design."""
         found: dict[Slot, TrialRecord] = {}
@@ -283,18 +283,18 @@ class SweepStudy:
                 found.setdefault(slot, TrialRecord(slot, values, trial.user_attrs["outcome"], merit or 0.0))
         return sorted(found.values(), key=lambda r: (r.slot.stage, r.slot.index, r.slot.candidate))
 
-    @_retried
+    @_retry_storage
     def result_folder(self) -> str | None:
         """Folder with the result of the complete sweep; ``None`` before there is one."""
         return self._study.user_attrs.get("finished_in")
 
-    @_retried
+    @_retry_storage
     def set_result_folder(self, folder: str) -> None:
         """Store the folder with the result of the complete sweep."""
         self._study.set_user_attr("finished_in", folder)
 
     # ------------------------------------------------------------------ storage
-    @_retried
+    @_retry_storage
     def _check_settings(self, settings: dict[str, Any]) -> None:
         known = current_keys(self._study.user_attrs.get("settings"))
         if known is None:

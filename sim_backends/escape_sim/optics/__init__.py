@@ -1,1 +1,4 @@
-"""Simulated optics and detectors: pupil, Shack-Hartmann and pyramid sensors, focal plane, detector noise."""
+"""Simulated optics and detectors: pupil, Shack-Hartmann and pyramid sensors, focal plane, detector noise.
+
+Models that SPRINT inverts are in ``models``.
+"""
