@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import logging
 import zlib
+from collections.abc import Mapping
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Self, TypeVar
 
@@ -30,6 +32,7 @@ from escape_hw.config.registry import (
 from escape_hw.config.system import SystemConfig
 from escape_hw.deprecation import renamed_members
 from escape_hw.errors import ConfigError
+from escape_hw.safety.limits import CAUTIOUS_LIMITS
 
 if TYPE_CHECKING:
     from threadpoolctl import threadpool_limits
@@ -251,7 +254,7 @@ def build_device(name: str, config: SystemConfig, kind: type[D]) -> D:
     return device
 
 
-def build_standalone_device(driver: str, kind: type[D], **settings: Any) -> D:
+def build_standalone_device(driver: str, kind: type[D], /, **settings: Any) -> D:
     """Build one device by its driver, without a system; opens nothing.
 
     Parameters
@@ -261,7 +264,8 @@ def build_standalone_device(driver: str, kind: type[D], **settings: Any) -> D:
     kind
         Required class of the device.
     **settings
-        Keywords of the driver's class, such as ``serial``.
+        Keywords of the driver's class, such as ``serial``; ``limits`` may be a table of those that differ
+        from :data:`CAUTIOUS_LIMITS <escape_hw.safety.limits.CAUTIOUS_LIMITS>`.
 
     Raises
     ------
@@ -269,10 +273,17 @@ def build_standalone_device(driver: str, kind: type[D], **settings: Any) -> D:
         The driver is unknown, not installed, of another class, works as a part of a system only, or does not
         take these settings.
     """
-    return call_factory(f"driver '{driver}'", kind, partial(device_class(driver), **settings))
+    made_by = device_class(driver)
+    limits = settings.get("limits")
+    if isinstance(limits, Mapping):
+        try:
+            settings["limits"] = replace(CAUTIOUS_LIMITS, **limits)
+        except (TypeError, ValueError) as error:
+            raise ConfigError(f"driver '{driver}': limits: {error}") from error
+    return call_factory(f"driver '{driver}'", kind, partial(made_by, **settings))
 
 
-def open_device(driver: str, **settings: Any) -> Device:
+def open_device(driver: str, /, **settings: Any) -> Device:
     """Open one device by its driver, without a system file.
 
     For example::
@@ -288,7 +299,8 @@ def open_device(driver: str, **settings: Any) -> Device:
     driver
         Name of a driver, such as ``"alpao"``, ``"ximea"``, ``"pi-e727"`` or ``"asm"``.
     **settings
-        Keywords of the driver's class: ``serial``, and the options on the page of the device.
+        Keywords of the driver's class: ``serial``, the options on the page of the device, and ``limits``, all
+        (``MirrorLimits``) or a table of those that differ.
 
     Raises
     ------

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -138,3 +139,13 @@ def test_a_device_is_opened_by_the_name_of_its_driver() -> None:
         escape_hw.open_device("alpao")
     with pytest.raises(ConfigError, match="'sim-alpao' works as a part of a system only"):
         escape_hw.open_device("sim-alpao")
+
+
+def test_limits_of_a_device_used_alone_may_be_a_table() -> None:
+    fresh("asdk", "set serial BAX118")
+    words = {"serial": "BAX118", "library": str(stand_in("asdk").path)}
+    with escape_hw.open_device("alpao", limits={"max_stroke": 0.3}, **words) as dm:
+        assert dm.limits == replace(CAUTIOUS_LIMITS, max_stroke=0.3)
+    for wrong in ({"max_stork": 0.3}, {"max_stroke": 3}):
+        with pytest.raises(ConfigError, match="driver 'alpao': limits: "):
+            escape_hw.open_device("alpao", limits=wrong, **words)
