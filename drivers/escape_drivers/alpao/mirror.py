@@ -26,7 +26,7 @@ from escape_hw.api.mirror import DeformableMirror, DMInfo
 from escape_hw.config.actuator_layouts import n_actuators
 from escape_hw.config.devices import mirror_info
 from escape_hw.config.section import Section
-from escape_hw.errors import CommandRejected, DeviceError, NotOpen
+from escape_hw.errors import CommandRejected, DeviceError, DeviceLost, NotOpen
 from escape_hw.safety.limits import CAUTIOUS_LIMITS, MirrorLimits
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ _CONFIG_VARIABLE = "ACECFG"
 
 
 class AlpaoOptions(Section):
-    """The ``[devices.dm.options]`` of this driver; what is left at its default is not sent.
+    """The ``[devices.dm.options]`` of this driver; what is left at its default is not sent, but the trigger.
 
     Parameters
     ----------
@@ -56,7 +56,8 @@ class AlpaoOptions(Section):
     ack_timeout_ms
         Longest wait for the electronics' acknowledgement; 0: as the SDK has it.
     trigger_in
-        Wait for an edge before each shape.
+        Wait for an edge before each shape. Set at every opening, because the electronics keep what another
+        program left; empty: off, if the electronics have triggers.
     trigger_out
         Length of the pulse that goes out with each shape.
     """
@@ -77,9 +78,12 @@ class AlpaoOptions(Section):
             wanted.append(("AckTimeout", float(self.ack_timeout_ms)))
         if self.trigger_out:
             wanted.append(("TriggerMode", _TRIGGER_OUT[self.trigger_out]))
-        if self.trigger_in:
-            wanted.append(("TriggerIn", _TRIGGER_IN[self.trigger_in]))
         return wanted
+
+    @property
+    def is_triggered(self) -> bool:
+        """Whether each shape waits for an edge."""
+        return self.trigger_in in ("rising", "falling")
 
 
 class AlpaoMirror(DeformableMirror):
@@ -183,6 +187,24 @@ class AlpaoMirror(DeformableMirror):
             library.call("asdkSendPattern", handle, pointer, len(sequence), repeats)
             self._guard_when_open().reset(sequence[-1])
 
+    def _set_trigger(self, library: AlpaoLibrary, handle: c_void_p, trigger_in: str) -> None:
+        """Set the trigger's edge; electronics without triggers need no "off"."""
+        try:
+            library.set(handle, "TriggerIn", _TRIGGER_IN[trigger_in])
+        except DeviceLost:
+            raise
+        except DeviceError as error:
+            if trigger_in != "off":
+                raise
+            log.debug("%s: has no trigger (%s)", self.name, error)
+
+    def _before_close(self) -> None:
+        """Without the trigger, so that the flat shape waits for no edge."""
+        library, handle = self._require_connected()
+        if self._options.is_triggered:
+            self._set_trigger(library, handle, "off")
+        super()._before_close()
+
     def stop_pattern(self) -> None:
         """Stop a sequence; the mirror keeps the shape it has. Does nothing when none runs."""
         with self._lock:
@@ -207,6 +229,7 @@ class AlpaoMirror(DeformableMirror):
         log.info("%s: SDK %s, mirror %s", self.name, version, self._serial)
         for name, value in self._options.sdk_parameters():
             library.set(handle, name, value)
+        self._set_trigger(library, handle, self._options.trigger_in or "off")
         self._playing = False
         # A function object of its own without prototype: both arguments are C pointers for good already,
         # and checking them at every call costs as much as the call.
@@ -247,6 +270,10 @@ class AlpaoMirror(DeformableMirror):
         if self._playing:
             library.call("asdkStop", handle)
             self._playing = False
+            if self._options.is_triggered:
+                # Users report that a second triggered sequence fails (0x102, 0x104) without this.
+                self._set_trigger(library, handle, "off")
+                self._set_trigger(library, handle, self._options.trigger_in)
 
     def _validate_sequence(self, patterns: ArrayLike, repeats: int) -> NDArray[np.float64]:
         guard = self._guard_when_open()
