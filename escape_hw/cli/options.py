@@ -25,7 +25,11 @@ Force = Annotated[bool, typer.Option("--force", help="Allow a simulated matrix o
 
 Driver = Annotated[
     str | None,
-    typer.Option("--driver", metavar="NAME", help="Driver of a real device, in place of a system."),
+    typer.Option(
+        "--driver",
+        metavar="NAME",
+        help="Driver of a real device, in place of a system; --set then gives its settings.",
+    ),
 ]
 Serial = Annotated[
     str | None, typer.Option("--serial", metavar="NUMBER", help="Serial number of the device, with --driver.")

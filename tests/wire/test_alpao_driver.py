@@ -62,9 +62,7 @@ def test_a_trigger_that_another_program_left_on_is_switched_off(asdk) -> None:
     asdk.clear().script("set triggers 0")
     with make("alpao") as dm:
         dm.send(np.full(97, 0.01))
-    with pytest.raises(
-        DeviceError, match=r"asdkSet\(TriggerIn, 1\) failed: error 0x10A.*take the option"
-    ):
+    with pytest.raises(DeviceError, match=r"asdkSet\(TriggerIn, 1\) failed: error 0x10A.*take the option"):
         make("alpao", "devices.dm.options.trigger_in=rising").open()
     assert not asdk.violations
 
