@@ -1,0 +1,12 @@
+"""Print the oldest version of every dependency that pyproject.toml allows, as constraints for pip."""
+
+import re
+import tomllib
+from pathlib import Path
+
+project = tomllib.loads(Path(__file__).parents[1].joinpath("pyproject.toml").read_text("utf-8"))["project"]
+groups = [project["dependencies"], *project["optional-dependencies"].values()]
+for requirement in sorted({requirement for group in groups for requirement in group}):
+    found = re.fullmatch(r"([A-Za-z0-9_.-]+)(?:\[[a-z,]+\])?>=([0-9.]+).*", requirement)
+    if found:
+        print(f"{found[1]}=={found[2]}")
