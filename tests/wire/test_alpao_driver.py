@@ -185,7 +185,7 @@ def test_patterns_reach_the_electronics_and_stop_before_anything_else(asdk) -> N
         dm.play_patterns(wave, repeats=3)
         assert asdk.calls[4:] == ["asdkSendPattern 8 0", "asdkStop", "asdkSendPattern 8 3"]
         dm.send(np.zeros(97))
-        assert asdk.names()[6:] == ["asdkStop", "asdkSend"]
+        assert asdk.names()[7:] == ["asdkStop", "asdkSend"]
         assert not dm._playing
         dm.play_patterns(wave, repeats=0)
     assert asdk.names()[-5:] == ["asdkStop", "asdkSend", "asdkStop", "asdkReset", "asdkRelease"]
