@@ -32,7 +32,7 @@ floor: ## Run the tests with the oldest versions that pyproject.toml allows
 	$(FLOOR)/bin/python .ci/floor.py > $(FLOOR)/constraints.txt
 	$(FLOOR)/bin/python -m pip --disable-pip-version-check install --quiet \
 		--constraint $(FLOOR)/constraints.txt --editable '.[test]'
-	$(ONE_THREAD) $(FLOOR)/bin/python -m pytest -n 2 --dist loadgroup $(ARGS)
+	$(ONE_THREAD) $(FLOOR)/bin/python -m pytest -n 2 --dist loadgroup -W default::DeprecationWarning $(ARGS)
 
 check: $(VENV)/dev.stamp ## Check style, types and layers
 	$(BIN)/ruff check .
