@@ -9,10 +9,14 @@ FIND = for p in python3.13 python3.12 python3.11 python3; do \
 PYTHON ?= $(shell $(FIND))
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet
 
+# The oldest versions are installed beside the newest, on the oldest Python, for which they have wheels.
+FLOOR := .venv-floor
+FLOOR_PYTHON ?= python3.11
+
 # One thread per process: two test processes whose linear algebra also starts threads slow each other down.
 ONE_THREAD := OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 NUMBA_NUM_THREADS=1 MPLBACKEND=Agg
 
-.PHONY: help run test test-all check docs perf clean
+.PHONY: help run test test-all floor check docs perf clean
 
 help: ## List the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*##/\t/'
@@ -26,6 +30,13 @@ test: $(VENV)/test.stamp ## Run the tests
 test-all: $(VENV)/all.stamp ## Run every test, also the slow ones, with all optional packages
 	$(BIN)/python tests/system_packages.py --install
 	$(ONE_THREAD) $(BIN)/python -m pytest -n 2 --dist loadgroup -m "not hardware and not screenshots" $(ARGS)
+
+floor: ## Run the tests with the oldest versions that pyproject.toml allows
+	$(FLOOR_PYTHON) -m venv $(FLOOR)
+	$(FLOOR)/bin/python .ci/floor.py > $(FLOOR)/constraints.txt
+	$(FLOOR)/bin/python -m pip --disable-pip-version-check install --quiet \
+		--constraint $(FLOOR)/constraints.txt --editable '.[test]'
+	$(ONE_THREAD) $(FLOOR)/bin/python -m pytest -n 2 --dist loadgroup -W default::DeprecationWarning $(ARGS)
 
 check: $(VENV)/dev.stamp ## Check style, types and layers
 	$(BIN)/ruff check .
@@ -41,7 +52,7 @@ perf: $(VENV)/bench.stamp ## Measure speed against OOPAO and pyRTC
 	$(BIN)/escape perf $(ARGS)
 
 clean: ## Remove the environment and caches
-	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+	rm -rf $(VENV) $(FLOOR) .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
 
 $(BIN)/python:
 	@test -n "$(PYTHON)" || { echo "No Python 3.11 or newer with venv found; set PYTHON=..." >&2; exit 1; }

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pyqtgraph
 from PySide6.QtCore import QObject, QTimer
+from PySide6.QtGui import QIcon
 from PySide6.QtWidgets import QApplication
 
 from escape_gui.client.connection import LiveSource, LocalServer, ServerAttachment
@@ -33,6 +34,7 @@ log = logging.getLogger(__name__)
 DEFAULT_SYSTEM = "razor-shwfs"
 #: Delay between a ready engine and the screenshot, and longest wait for the engine; milliseconds.
 _SCREENSHOT_DELAY_MS, _SCREENSHOT_TIMEOUT_MS = 4000, 60_000
+_ICON = Path(__file__).with_name("escape.svg")
 #: Niceness of the window's process, so that a loop on the same computer takes precedence.
 _NICENESS = 10
 
@@ -60,6 +62,9 @@ def qt_application() -> QApplication:
     existing = QApplication.instance()
     qt_app = existing if isinstance(existing, QApplication) else QApplication(sys.argv[:1])
     qt_app.setApplicationName("ESCAPE")
+    # The desktop entry of this name has the same icon, where it is installed.
+    qt_app.setDesktopFileName("escape")
+    qt_app.setWindowIcon(QIcon(str(_ICON)))
     # Antialiased curves take five times as long to draw.
     pyqtgraph.setConfigOptions(imageAxisOrder="row-major", antialias=False)
     return qt_app

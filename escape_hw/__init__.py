@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from escape_hw.api.registration import Registration
     from escape_hw.api.results import CalibrationResult, Estimate, LoopResult, RegistrationEstimate
     from escape_hw.api.sensor import SensorGeometry, SubApertureGrid
+    from escape_hw.bench import open_device
     from escape_hw.calibration.acquisition.checkpoint import Checkpoint
     from escape_hw.calibration.acquisition.model_psf import measure_model_psf
     from escape_hw.calibration.acquisition.sensor_setup import find_sensor, measure_dark
@@ -45,7 +46,7 @@ if TYPE_CHECKING:
     from escape_hw.calibration.sprint.fit import sprint
     from escape_hw.config.bundled import bundled_systems
     from escape_hw.config.loader import load_system
-    from escape_hw.config.registry import register_device
+    from escape_hw.config.registry import DeviceContext, register_device
     from escape_hw.io.fits.matrix import load_matrix, save_matrix
     from escape_hw.remote.client import Connection, connect
     from escape_hw.runtime.session.system import System, open_system
@@ -65,6 +66,7 @@ _NAMES = {
     "escape_hw.api.registration": "Registration",
     "escape_hw.api.results": "CalibrationResult Estimate LoopResult RegistrationEstimate",
     "escape_hw.api.sensor": "SensorGeometry SubApertureGrid",
+    "escape_hw.bench": "open_device",
     "escape_hw.calibration.acquisition.checkpoint": "Checkpoint",
     "escape_hw.calibration.acquisition.model_psf": "measure_model_psf",
     "escape_hw.calibration.acquisition.sensor_setup": "find_sensor measure_dark",
@@ -78,7 +80,7 @@ _NAMES = {
     "escape_hw.calibration.sprint.fit": "sprint",
     "escape_hw.config.bundled": "bundled_systems",
     "escape_hw.config.loader": "load_system",
-    "escape_hw.config.registry": "register_device",
+    "escape_hw.config.registry": "DeviceContext register_device",
     "escape_hw.io.fits.matrix": "load_matrix save_matrix",
     "escape_hw.remote.client": "Connection connect",
     "escape_hw.runtime.session.system": "System open_system",
@@ -93,13 +95,14 @@ _PUBLIC_MODULES = {
 
 __all__ = [
     "AdaptiveSecondary", "CalibrationResult", "Camera", "CameraInfo", "CameraSettings", "Checkpoint",
-    "Connection", "DMInfo", "DeformableMirror", "Estimate", "Frame", "InteractionMatrix", "LoopResult",
-    "MirrorLimits", "Modulation", "ModulatorInfo", "ModulatorStatus", "PhaseScreen", "Procedure",
-    "Progress", "PyramidPupils", "Region", "Registration", "RegistrationEstimate", "Reporter", "ScreenInfo",
-    "ScreenState", "SendReport", "SensorGeometry", "ShellHealth", "ShellState", "SubApertureGrid", "System",
-    "Target", "TipTiltModulator", "__version__", "bundled_systems", "close_loop", "connect",
-    "docrime", "docrime_closed_loop", "errors", "escape", "find_best_gain", "find_sensor", "load_matrix",
-    "load_system", "measure_dark", "measure_model_psf", "open_system", "push_pull", "register_device", "run",
+    "Connection", "DMInfo", "DeformableMirror", "DeviceContext", "Estimate", "Frame",
+    "InteractionMatrix", "LoopResult", "MirrorLimits", "Modulation", "ModulatorInfo", "ModulatorStatus",
+    "PhaseScreen", "Procedure", "Progress", "PyramidPupils", "Region", "Registration",
+    "RegistrationEstimate", "Reporter", "ScreenInfo", "ScreenState", "SendReport", "SensorGeometry",
+    "ShellHealth", "ShellState", "SubApertureGrid", "System", "Target", "TipTiltModulator",
+    "__version__", "bundled_systems", "close_loop", "connect", "docrime", "docrime_closed_loop",
+    "errors", "escape", "find_best_gain", "find_sensor", "load_matrix", "load_system", "measure_dark",
+    "measure_model_psf", "open_device", "open_system", "push_pull", "register_device", "run",
     "save_matrix", "sprint", "testing",
 ]  # fmt: skip
 

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import logging
 import zlib
-from typing import TYPE_CHECKING, Self, TypeVar
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import partial
+from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,10 +22,17 @@ from escape_hw.api.phase_screen import PhaseScreen
 from escape_hw.api.sensor import SensorGeometry
 from escape_hw.api.synthetic_model import SyntheticModel
 from escape_hw.config.devices import DeviceConfig
-from escape_hw.config.registry import call_factory, device_factory, model_factory
+from escape_hw.config.registry import (
+    DeviceContext,
+    call_factory,
+    device_class,
+    device_factory,
+    model_factory,
+)
 from escape_hw.config.system import SystemConfig
 from escape_hw.deprecation import renamed_members
 from escape_hw.errors import ConfigError
+from escape_hw.safety.limits import CAUTIOUS_LIMITS
 
 if TYPE_CHECKING:
     from threadpoolctl import _ThreadpoolLimiter
@@ -244,6 +254,65 @@ def build_device(name: str, config: SystemConfig, kind: type[D]) -> D:
     return device
 
 
+def build_standalone_device(driver: str, kind: type[D], /, **settings: Any) -> D:
+    """Build one device by its driver, without a system; opens nothing.
+
+    Parameters
+    ----------
+    driver
+        Name of a driver, such as ``"alpao"``.
+    kind
+        Required class of the device.
+    **settings
+        Keywords of the driver's class, such as ``serial``; ``limits`` may be a table of those that differ
+        from :data:`CAUTIOUS_LIMITS <escape_hw.safety.limits.CAUTIOUS_LIMITS>`.
+
+    Raises
+    ------
+    ConfigError
+        The driver is unknown, not installed, of another class, works as a part of a system only, or does not
+        take these settings.
+    """
+    made_by = device_class(driver)
+    limits = settings.get("limits")
+    if isinstance(limits, Mapping):
+        try:
+            settings["limits"] = replace(CAUTIOUS_LIMITS, **limits)
+        except (TypeError, ValueError) as error:
+            raise ConfigError(f"driver '{driver}': limits: {error}") from error
+    return call_factory(f"driver '{driver}'", kind, partial(made_by, **settings))
+
+
+def open_device(driver: str, /, **settings: Any) -> Device:
+    """Open one device by its driver, without a system file.
+
+    For example::
+
+        with escape_hw.open_device("alpao", serial="BAX118") as dm:
+            dm.send(dm.flat)
+
+    Every command to a mirror passes the guard, with the limits of :data:`CAUTIOUS_LIMITS
+    <escape_hw.safety.limits.CAUTIOUS_LIMITS>` unless ``limits`` gives others.
+
+    Parameters
+    ----------
+    driver
+        Name of a driver, such as ``"alpao"``, ``"ximea"``, ``"pi-e727"`` or ``"asm"``.
+    **settings
+        Keywords of the driver's class: ``serial``, the options on the page of the device, and ``limits``, all
+        (``MirrorLimits``) or a table of those that differ.
+
+    Raises
+    ------
+    ConfigError
+        The driver is unknown, is a twin (which is part of a system), or does not take these settings; nothing
+        was opened.
+    DeviceError
+        The device cannot be reached.
+    """
+    return build_standalone_device(driver, Device, **settings).open()  # type: ignore[type-abstract]
+
+
 def resolve_mode(section: DeviceConfig, config: SystemConfig) -> str:
     """Mode of a device: its own, or the system's if it has none."""
     return section.mode or config.system.mode
@@ -263,4 +332,5 @@ def _build(
         factory = device_factory(driver, hardware=not twin)
     except ConfigError as error:
         raise ConfigError(f"devices.{name}: {error}") from error
-    return call_factory(f"devices.{name}: driver '{driver}'", kind, factory, name, config, shared)
+    context = DeviceContext(name, config, shared)
+    return call_factory(f"devices.{name}: driver '{driver}'", kind, factory, section, context)

@@ -8,6 +8,8 @@ import logging
 import numpy as np
 
 import escape_hw
+from escape_hw.config.actuator_layouts import actuator_map
+from escape_hw.safety.limits import CAUTIOUS_LIMITS
 
 logging.getLogger("escape_hw").setLevel(logging.ERROR)  # the checks provoke failures
 
@@ -26,10 +28,17 @@ class AcmeElectronics:
 class AcmeMirror(escape_hw.DeformableMirror):
     """A driver implements four members; guard, ramps, counters and errors are in the base class."""
 
-    def __init__(self, name: str, layout: np.ndarray, limits: escape_hw.MirrorLimits) -> None:
+    def __init__(
+        self, serial: str, *, name: str = "acme", limits: escape_hw.MirrorLimits = CAUTIOUS_LIMITS
+    ) -> None:
         super().__init__(name, limits)
-        self._layout = layout
+        self._serial, self._layout = serial, actuator_map("circle-11")
         self._electronics: AcmeElectronics | None = None
+
+    @classmethod
+    def from_section(cls, section, context) -> "AcmeMirror":
+        """The mirror of a system; a package names the class in its entry points ``escape.devices``."""
+        return cls(section.serial, name=context.name, limits=section.limits.to_limits())
 
     @property
     def info(self) -> escape_hw.DMInfo:
@@ -37,7 +46,7 @@ class AcmeMirror(escape_hw.DeformableMirror):
         rows, columns = np.nonzero(self._layout)
         positions_m = 1.5e-3 * (np.stack([columns, rows], axis=1) - (len(self._layout) - 1) / 2)
         return escape_hw.DMInfo(
-            model="Acme 97", serial="A-0001", n_act=len(positions_m), layout=self._layout,
+            model="Acme 97", serial=self._serial, n_act=len(positions_m), layout=self._layout,
             positions_m=positions_m, stroke_m=2.0e-6, simulated=True,
         )  # fmt: skip
 
@@ -52,23 +61,22 @@ class AcmeMirror(escape_hw.DeformableMirror):
         self._electronics.write(np.rint(8192 + 8191 * command).astype(np.uint16))
 
 
-def make_mirror(name: str, config, shared) -> AcmeMirror:
-    """Factory; a package declares it under [project.entry-points."escape.devices"]."""
-    dm = config.devices.dm
-    return AcmeMirror(name, dm.actuator_map(), dm.limits.to_limits())
-
-
 if __name__ == "__main__":
     # Level 1 moves by at most a percent, for the first test of a real mirror; level 3 uses the full range
     # within the limits.
-    config = escape_hw.load_system("razor-shwfs")
-    results = escape_hw.testing.run_checks(lambda: make_mirror("acme", config, {}), max_level=3)
+    results = escape_hw.testing.run_checks(lambda: AcmeMirror("A-0001"), max_level=3)
     for result in results:
         print(f"{result.outcome:>8}  {result.check}  {result.message}".rstrip())
 
-    # Register the driver, so that a configuration or --set can name it. This mirror is not in the simulated
+    # Alone, by the name of its driver.
+    escape_hw.register_device("acme", AcmeMirror)
+    with escape_hw.open_device("acme", serial="A-0001") as dm:
+        shape = dm.flat
+        shape[48] = 0.05
+        print(dm.send(shape).guard)
+
+    # In a system, so that a configuration or --set can name it. This mirror is not in the simulated
     # beam; see docs/devices/add-a-driver.md.
-    escape_hw.register_device("acme", make_mirror)
     with escape_hw.open_system("razor-shwfs", set=["devices.dm.sim_driver=acme"]) as bench:
         report = bench.dm.send(np.full(bench.dm.info.n_act, 0.9))
         print(f"{bench.dm.info.model}: requested 0.9, sent {report.sent.max():.3f}; {report.guard}")

@@ -1,4 +1,6 @@
-"""Drivers of real hardware, found through the entry points ``escape.devices``.
+"""Drivers of real hardware.
 
-Vendor libraries are loaded when a device is opened. Twins, emulators and stand-ins are in ``escape_sim``.
+A driver is a class that can be used alone, ``AlpaoMirror(serial="BAX118")``, or in a system, which finds it
+through the entry points ``escape.devices``. Vendor libraries are loaded when a device is opened. Twins,
+emulators and stand-ins are in ``escape_sim``.
 """

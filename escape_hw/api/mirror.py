@@ -32,7 +32,7 @@ class DMInfo:
         Actuator positions ``(n_act, 2)`` as (x, y) in metres on the mirror, from its centre; x increases
         along the columns of the layout, y along its rows.
     stroke_m
-        Metres of surface at the actuator for a command of 1.
+        Metres of surface at the actuator for a command of 1; NaN if it is not known.
     """
 
     model: str

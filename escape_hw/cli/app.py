@@ -44,7 +44,7 @@ def build_app() -> typer.Typer:
         epilog="Exit codes: 0 done · 1 finished but failed its own criterion · 2 bad usage or configuration, "
         "nothing opened · 3 device or safety fault, mirror made safe · 130 aborted, partial data saved.",
         no_args_is_help=True,
-        add_completion=False,
+        add_completion=True,
         pretty_exceptions_enable=False,
         rich_markup_mode="rich",
     )

@@ -11,6 +11,7 @@ from escape_hw.cli.context import command_context
 
 Command = Callable[..., None]
 _SELECTION: dict[str, Any] = {"set": options.Set, "seed": options.Seed, "mode": options.Mode}
+_DEVICE: dict[str, Any] = {"driver": options.Driver, "serial": options.Serial}
 
 
 def command(name: str, *, quiet: bool = False, without: tuple[str, ...] = ()) -> Callable[[Command], Command]:
@@ -55,7 +56,8 @@ def build_command(
         else:
             declared.append(keyword(one.name, one.annotation, one.default))
     if selection is not None:
-        declared += [keyword(key, kind, None) for key, kind in _SELECTION.items() if key not in without]
+        choices = _SELECTION | (_DEVICE if selection.annotation == options.DeviceSelection else {})
+        declared += [keyword(key, kind, None) for key, kind in choices.items() if key not in without]
     declared.append(keyword("json", options.Json, False))
     if quiet:
         declared.append(keyword("quiet", options.Quiet, False))
@@ -65,8 +67,11 @@ def build_command(
         with command_context(name, json=bool(given["json"]), quiet=bool(given["quiet"])) as context:
             if selection is not None:
                 changes, seed, mode = (values.pop(key, None) for key in _SELECTION)
+                driver, serial = (values.pop(key, None) or "" for key in _DEVICE)
                 system = values.pop("system") or ""
-                values["selection"] = options.SystemSelection(system, tuple(changes or ()), seed, mode)
+                values["selection"] = options.SystemSelection(
+                    system, tuple(changes or ()), seed, mode, driver, serial
+                )
             function(context, **values)
 
     wrapper.__name__, wrapper.__doc__ = name.replace("-", "_"), help or function.__doc__

@@ -23,14 +23,29 @@ Mode = Annotated[str | None, typer.Option("--mode", metavar="sim|hardware", help
 Force = Annotated[bool, typer.Option("--force", help="Allow a simulated matrix on hardware.")]
 
 
+Driver = Annotated[
+    str | None,
+    typer.Option(
+        "--driver",
+        metavar="NAME",
+        help="Driver of a real device, in place of a system; --set then gives its settings.",
+    ),
+]
+Serial = Annotated[
+    str | None, typer.Option("--serial", metavar="NUMBER", help="Serial number of the device, with --driver.")
+]
+
+
 @dataclass(frozen=True, slots=True)
 class SystemSelection:
-    """A system and the changes to its configuration."""
+    """A system and the changes to its configuration; or the driver of one device and its settings."""
 
     system: str
     set: tuple[str, ...] = ()
     seed: int | None = None
     mode: str | None = None
+    driver: str = ""
+    serial: str = ""
 
     def with_overrides(self, *overrides: str) -> SystemSelection:
         """The selection with further overrides, applied last."""
@@ -40,6 +55,11 @@ class SystemSelection:
 #: A command's system, named by its argument; see :func:`~escape_hw.cli.command.command`.
 Selection = Annotated[
     SystemSelection, typer.Argument(help="Name of a system (see 'escape systems') or a TOML file.")
+]
+#: A system or, with ``--driver``, none; see :class:`~escape_hw.cli.devices.device_tools.DeviceCommand`.
+DeviceSelection = Annotated[
+    SystemSelection,
+    typer.Argument(help="Name of a system (see 'escape systems') or a TOML file; none with --driver."),
 ]
 #: Default of a command whose argument may be left out.
 NO_SYSTEM = SystemSelection("")

@@ -160,13 +160,34 @@ class LimitsConfig(Section):
     max_mean: float | None = Field(
         None, gt=0, le=1, description="largest magnitude of the mean (piston), fraction of full stroke"
     )
+    max_abs_sum: float | None = Field(
+        None,
+        gt=0,
+        le=10_000,
+        description="largest sum of the magnitudes of all commands, in full strokes",
+    )
     disabled: TomlArray[tuple[Annotated[int, Field(ge=0)], ...]] = Field(
         (), description="indices of the actuators that must stay at zero"
     )
 
     def to_limits(self) -> MirrorLimits:
         """The limits for the guard."""
-        return MirrorLimits(self.max_stroke, self.max_slew, self.max_neighbour, self.max_mean, self.disabled)
+        return MirrorLimits(**self.model_dump())
+
+
+def mirror_info(
+    layout: str, pitch_m: float, stroke_m: float, model: str, serial: str, *, simulated: bool
+) -> DMInfo:
+    """Identity and nominal geometry of a mirror whose actuators are arranged as ``layout``."""
+    return DMInfo(
+        model,
+        serial,
+        actuator_layouts.n_actuators(layout),
+        actuator_layouts.actuator_map(layout) if actuator_layouts.is_on_grid(layout) else None,
+        actuator_layouts.positions(layout) * pitch_m,
+        stroke_m,
+        simulated,
+    )
 
 
 class MirrorConfig(DeviceConfig):
@@ -204,15 +225,8 @@ class MirrorConfig(DeviceConfig):
 
     def info(self, model: str, *, simulated: bool, serial: str = "") -> DMInfo:
         """Identity and nominal geometry for a driver or twin; ``serial`` is by default as configured."""
-        positions_m = self.positions() * self.pitch_m
-        return DMInfo(
-            model,
-            serial or self.serial,
-            self.n_act,
-            self.actuator_map(),
-            positions_m,
-            self.stroke_m,
-            simulated,
+        return mirror_info(
+            self.layout, self.pitch_m, self.stroke_m, model, serial or self.serial, simulated=simulated
         )
 
     @model_validator(mode="after")

@@ -6,6 +6,7 @@ import importlib.metadata
 import inspect
 import traceback
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -16,6 +17,7 @@ from escape_hw.api.sensor import SensorGeometry
 from escape_hw.api.synthetic_model import SyntheticModel
 from escape_hw.config.key_tree import closest_match
 from escape_hw.config.system import SystemConfig
+from escape_hw.deprecation import warn_renamed
 from escape_hw.errors import ConfigError, EscapeError
 
 T = TypeVar("T")
@@ -78,6 +80,7 @@ def call_factory(what: str, kind: type[T], factory: Callable[..., object], *argu
 
 
 def _factory_name(factory: object) -> str:
+    factory = factory.func if isinstance(factory, partial) else factory
     module, name = (getattr(factory, key, "") for key in ("__module__", "__qualname__"))
     return f"{module}:{name}" if module and name else repr(factory)
 
@@ -101,7 +104,7 @@ _KINDS = {
 }
 #: Arguments of the factories of each group.
 _PARAMETERS = {
-    DEVICES: ("name", "config", "shared"),
+    DEVICES: ("section", "context"),
     MODELS: ("config", "grid"),
     EMULATORS: ("request",),
     STAND_INS: ("config",),
@@ -110,18 +113,43 @@ _PARAMETERS = {
 #: Prefix of the names of twins; other drivers are for real hardware.
 TWIN_PREFIX = "sim-"
 
-#: ``factory(name, config, shared) -> device``: the key in ``[devices]``, the whole configuration and
-#: one dictionary per opened system, which the twins of a bench share.
-DeviceFactory = Callable[[str, SystemConfig, dict[str, object]], Device]
+
+@dataclass(frozen=True, slots=True)
+class DeviceContext:
+    """What a device is part of; second argument of every factory.
+
+    Parameters
+    ----------
+    name
+        Key of the device in ``[devices]``, used in messages.
+    system
+        Configuration of the system; ``None`` for a device opened alone.
+    shared
+        One dictionary for each opened system, which the twins of a bench share.
+    """
+
+    name: str
+    system: SystemConfig | None = None
+    shared: dict[str, object] = field(default_factory=dict)
+
+    def require_system(self) -> SystemConfig:
+        """The configuration of the system; raises ``ConfigError`` for a device opened alone."""
+        if self.system is None:
+            raise ConfigError(f"{self.name}: is part of a system and cannot be opened alone; open the system")
+        return self.system
+
+
+#: ``factory(section, context) -> device``: the device's own section of ``[devices]`` and its context.
+DeviceFactory = Callable[[Any, DeviceContext], Device]
 #: ``factory(config, grid) -> model``; without a grid the model uses the nominal one.
 ModelFactory = Callable[[SystemConfig, SensorGeometry | None], SyntheticModel]
 #: ``run(system, address, screenshot, reset_settings) -> exit code``: shows the window until it is closed.
 WindowRunner = Callable[[str, str, Path | None, bool], int]
 #: Drivers that a script registered for its own process.
-_REGISTERED: dict[str, DeviceFactory] = {}
+_REGISTERED: dict[str, DeviceFactory | type[Device]] = {}
 
 
-def register_device(name: str, factory: DeviceFactory) -> None:
+def register_device(name: str, factory: DeviceFactory | type[Device]) -> None:
     """Register a driver or twin in this process, for scripts and notebooks.
 
     A package declares an entry point in the group ``escape.devices`` instead. Registering a name again
@@ -132,14 +160,15 @@ def register_device(name: str, factory: DeviceFactory) -> None:
     name
         Value of ``driver`` or ``sim_driver`` in a device section.
     factory
-        ``factory(name, config, shared)`` returns a device that is not open, see :data:`DeviceFactory`.
+        A class of devices with ``from_section(section, context)``, or a function
+        ``factory(section, context)`` that returns a device that is not open, see :data:`DeviceFactory`.
 
     Raises
     ------
     ConfigError
         An installed package provides this name, or the factory is not callable with these arguments.
     """
-    require_factory(f"device driver '{name}'", repr(factory), factory, _PARAMETERS[DEVICES])
+    _as_device_factory(f"device driver '{name}'", repr(factory), factory)
     if any(entry.name == name for entry in importlib.metadata.entry_points(group=DEVICES)):
         raise ConfigError(f"device driver '{name}' is provided by an installed package; choose another name")
     _REGISTERED[name] = factory
@@ -159,7 +188,65 @@ def device_factory(name: str, *, hardware: bool = False) -> DeviceFactory:
     ConfigError
         Unknown name (the message gives the closest one), or its package is not completely installed.
     """
-    return _REGISTERED[name] if name in _REGISTERED else cast(DeviceFactory, _load(DEVICES, name, hardware))
+    return _as_device_factory(*_find_device(name, hardware))
+
+
+def device_class(name: str) -> type[Device]:
+    """The class of a driver that can be opened without a system: its keywords are the driver's own.
+
+    Raises
+    ------
+    ConfigError
+        As :func:`device_factory`, or the driver works as a part of a system only.
+    """
+    *_, found = _find_device(name, hardware=not name.startswith(TWIN_PREFIX))
+    if isinstance(found, type) and issubclass(found, Device):
+        return found
+    raise ConfigError(
+        f"device driver '{name}' works as a part of a system only; open the system (open_system, or its name "
+        "in place of --driver)"
+    )
+
+
+def _find_device(name: str, hardware: bool) -> tuple[str, str, Any]:
+    """Name of a driver for messages, where it is, and what is there: a class of devices or a function."""
+    if name in _REGISTERED:
+        return f"device driver '{name}'", repr(_REGISTERED[name]), _REGISTERED[name]
+    entry = _find_entry(DEVICES, name, hardware)
+    return f"device driver '{name}' of {_package(entry)}", entry.value, _load_entry(_KINDS[DEVICES], entry)
+
+
+def _as_device_factory(what: str, where: str, found: Any) -> DeviceFactory:
+    """A class or function as a factory; functions ``(name, config, shared)`` of version 0.1.0 are wrapped."""
+    if isinstance(found, type) and issubclass(found, Device):
+        factory = getattr(found, "from_section", None)
+        if factory is None:
+            raise ConfigError(
+                f"{what} is broken: {where} has no class method from_section(section, context); add it"
+            )
+        return cast(DeviceFactory, factory)
+    if _takes_three(found):
+        warn_renamed(
+            f"{what}: {where} takes (name, config, shared); since version 0.2.0 factories take (section, "
+            "context), where context has name, system and shared; version 0.3.0 removes the old form"
+        )
+        return lambda section, context: found(context.name, context.require_system(), context.shared)
+    require_factory(what, where, found, _PARAMETERS[DEVICES])
+    return cast(DeviceFactory, found)
+
+
+def _takes_three(found: Any) -> bool:
+    """Whether a function has the three parameters of version 0.1.0."""
+    try:
+        signature = inspect.signature(found)
+        signature.bind("name", "config", "shared")
+    except (TypeError, ValueError):
+        return False
+    try:
+        signature.bind("section", "context")
+    except TypeError:
+        return True
+    return next(iter(signature.parameters)) == "name"
 
 
 def model_factory(name: str) -> ModelFactory:
@@ -184,8 +271,15 @@ def window_runner() -> WindowRunner:
     return cast(WindowRunner, _load(WINDOWS, "gui"))
 
 
-def _load(group: str, name: str, hardware: bool = False) -> Any:
-    kind = _KINDS[group]
+def _load(group: str, name: str) -> Any:
+    entry = _find_entry(group, name)
+    factory = _load_entry(_KINDS[group], entry)
+    what = f"{_KINDS[group]} '{name}' of {_package(entry)}"
+    require_factory(what, entry.value, factory, _PARAMETERS[group])
+    return factory
+
+
+def _find_entry(group: str, name: str, hardware: bool = False) -> importlib.metadata.EntryPoint:
     entries = {
         entry.value: entry for entry in importlib.metadata.entry_points(group=group) if entry.name == name
     }
@@ -193,18 +287,22 @@ def _load(group: str, name: str, hardware: bool = False) -> Any:
         raise ConfigError(_unknown_name_message(group, name, hardware))
     if len(entries) > 1:
         owners = " and ".join(f"{value} ({_package(entry)})" for value, entry in sorted(entries.items()))
-        raise ConfigError(f"{kind} '{name}' is provided twice: {owners}; uninstall one of the packages")
+        raise ConfigError(
+            f"{_KINDS[group]} '{name}' is provided twice: {owners}; uninstall one of the packages"
+        )
     (entry,) = entries.values()
+    return entry
+
+
+def _load_entry(kind: str, entry: importlib.metadata.EntryPoint) -> Any:
     try:
-        factory = entry.load()
+        return entry.load()
     except ImportError as error:
         raise ConfigError(_missing_module_message(kind, entry, error)) from error
     except AttributeError as error:
         raise ConfigError(
-            f"{kind} '{name}' of {_package(entry)} is broken: {entry.value} does not exist ({error})"
+            f"{kind} '{entry.name}' of {_package(entry)} is broken: {entry.value} does not exist ({error})"
         ) from error
-    require_factory(f"{kind} '{name}' of {_package(entry)}", entry.value, factory, _PARAMETERS[group])
-    return factory
 
 
 def _unknown_name_message(group: str, name: str, hardware: bool) -> str:

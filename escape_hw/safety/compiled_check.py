@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from numba import njit
 
 
@@ -17,6 +19,7 @@ def obeys_limits(  # type: ignore[no-untyped-def]
     max_slew,
     max_mean,
     max_neighbour,
+    max_abs_sum,
 ):  # pragma: no cover
     """Whether a shape ``(n_act,)`` obeys every limit; NaN does not.
 
@@ -34,6 +37,12 @@ def obeys_limits(  # type: ignore[no-untyped-def]
         mean += shape[i] * mean_weights[i]
     if not abs(mean) <= max_mean:
         return False
+    if max_abs_sum < math.inf:
+        total = 0.0
+        for i in range(shape.size):
+            total += abs(shape[i])
+        if not total <= max_abs_sum:
+            return False
     for k in range(first_of_pair.size):
         if not abs(shape[first_of_pair[k]] - shape[second_of_pair[k]]) <= max_neighbour:
             return False

@@ -30,7 +30,8 @@ class GuardReport:
     disabled
         Number of disabled actuators with a non-zero command.
     scale
-        Factor applied to the shape to respect ``max_neighbour`` and ``max_mean``; 1 if not needed.
+        Factor applied to the shape to respect ``max_neighbour``, ``max_mean`` and ``max_abs_sum``; 1 if not
+        needed.
     mean_removed
         Mean subtracted to respect ``max_mean``, fraction of full stroke.
     """
@@ -104,7 +105,7 @@ class CommandGuard:
             self._second_of_pair if neighbours else none,
             limits.max_stroke,
             *(off if limit is None else limit + _ROUNDING
-              for limit in (limits.max_slew, limits.max_mean, limits.max_neighbour)),
+              for limit in (limits.max_slew, limits.max_mean, limits.max_neighbour, limits.max_abs_sum)),
         )  # fmt: skip
 
     def validate(self, command: ArrayLike) -> NDArray[np.float64]:
@@ -199,6 +200,10 @@ class CommandGuard:
             step = self._worst_step(shape)
             if step > lim.max_neighbour + _ROUNDING:
                 return f"two neighbours exceed max_neighbour = {lim.max_neighbour} ({step:.6g})"
+        if lim.max_abs_sum is not None:
+            total = float(np.abs(shape).sum())
+            if total > lim.max_abs_sum + _ROUNDING:
+                return f"the sum of magnitudes exceeds max_abs_sum = {lim.max_abs_sum} ({total:.6g})"
         return None
 
     def largest_legal_scale(self, shape: ArrayLike) -> float:
@@ -282,7 +287,7 @@ class CommandGuard:
         return (shape if scale == 1.0 else shape * scale), clipped, disabled, scale, removed
 
     def _scale(self, shape: NDArray[np.float64]) -> float:
-        """Largest factor up to 1 at which ``shape`` obeys the neighbour and mean rules."""
+        """Largest factor up to 1 at which ``shape`` obeys the rules on neighbours, mean and sum."""
         lim, scale = self.limits, 1.0
         if lim.max_mean is not None:
             mean = abs(float(shape.dot(self._mean_weights)))
@@ -290,6 +295,9 @@ class CommandGuard:
         if lim.max_neighbour is not None and self._first_of_pair.size:
             step = self._worst_step(shape)
             scale = min(scale, lim.max_neighbour / step) if step > lim.max_neighbour + _ROUNDING else scale
+        if lim.max_abs_sum is not None:
+            total = float(np.abs(shape).sum())
+            scale = min(scale, lim.max_abs_sum / total) if total > lim.max_abs_sum + _ROUNDING else scale
         return scale
 
     def _apply_slew_limit(self, legal: NDArray[np.float64]) -> tuple[NDArray[np.float64], int]:

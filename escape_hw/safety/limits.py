@@ -28,6 +28,8 @@ class MirrorLimits:
         Largest magnitude of the mean over the enabled actuators (piston drift).
     disabled
         Indices of actuators that must stay at zero, counted from 0.
+    max_abs_sum
+        Largest sum of the magnitudes of all commands, in full strokes (current or heat of the electronics).
 
     Raises
     ------
@@ -40,11 +42,12 @@ class MirrorLimits:
     max_neighbour: float | None = None
     max_mean: float | None = None
     disabled: tuple[int, ...] = ()
+    max_abs_sum: float | None = None
 
     def __post_init__(self) -> None:
         if not 0.0 < self.max_stroke <= 1.0:
             raise ValueError(f"max_stroke is {self.max_stroke}; it must lie in (0, 1]")
-        for name in ("max_slew", "max_neighbour", "max_mean"):
+        for name in ("max_slew", "max_neighbour", "max_mean", "max_abs_sum"):
             value = getattr(self, name)
             if value is not None and not value > 0.0:
                 raise ValueError(f"{name} is {value}; it must be positive, or None to switch it off")
@@ -55,6 +58,12 @@ class MirrorLimits:
         if any(i < 0 for i in disabled):
             raise ValueError(f"disabled is {disabled}; actuators are counted from 0")
         object.__setattr__(self, "disabled", disabled)
+
+
+#: Limits of a mirror that is opened without a system file and without limits.
+CAUTIOUS_LIMITS = MirrorLimits(
+    max_stroke=0.5, max_slew=0.2, max_neighbour=0.4, max_mean=0.1, max_abs_sum=20.0
+)
 
 
 def neighbour_pairs(layout: NDArray[np.bool_]) -> NDArray[np.intp]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import unittest
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -26,7 +27,7 @@ def small_poke(dm: DeformableMirror, amplitude: float = 0.01) -> NDArray[np.floa
     enabled = np.setdiff1d(np.arange(flat.size), lim.disabled)
     if not enabled.size:
         raise unittest.SkipTest(f"{dm.name}: every actuator is disabled")
-    bounds = (lim.max_stroke, lim.max_slew, lim.max_neighbour, lim.max_mean)
+    bounds = (lim.max_stroke, lim.max_slew, lim.max_neighbour, lim.max_mean, lim.max_abs_sum)
     size = min(amplitude, *(0.5 * bound for bound in bounds if bound is not None))
     chosen = enabled[np.abs(flat[enabled]).argmin()]
     flat[chosen] += -size if flat[chosen] > 0 else size
@@ -68,6 +69,8 @@ def limit_violations(
     enabled = np.setdiff1d(np.arange(after.size), lim.disabled)
     if lim.max_mean is not None and enabled.size and abs(after[enabled].mean()) > lim.max_mean + ROUNDING:
         found.append(f"mean {after[enabled].mean():.6g} > {lim.max_mean}")
+    if lim.max_abs_sum is not None and np.abs(after).sum() > lim.max_abs_sum + ROUNDING:
+        found.append(f"sum of magnitudes {np.abs(after).sum():.6g} > {lim.max_abs_sum}")
     if lim.max_neighbour is not None:
         layout = dm.info.layout
         pairs = nearest_pairs(dm.info.positions_m) if layout is None else neighbour_pairs(layout)
@@ -231,7 +234,9 @@ def check_mirror_info_is_complete(dm: DeformableMirror) -> None:
     assert_identified(info, DMInfo)
     assert info.serial, "info.serial is empty; products need it"
     assert info.n_act >= 1, f"info.n_act is {info.n_act}"
-    assert 0 < info.stroke_m < 1, f"info.stroke_m is {info.stroke_m}; the unit is metres of surface"
+    assert 0 < info.stroke_m < 1 or math.isnan(info.stroke_m), (
+        f"info.stroke_m is {info.stroke_m}; the unit is metres of surface, NaN if it is not known"
+    )
     assert isinstance(dm.limits, MirrorLimits), f"limits is {type(dm.limits).__name__}"
     _require_geometry(info)
 

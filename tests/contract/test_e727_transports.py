@@ -7,9 +7,10 @@ from functools import cache
 
 from usb_bus import VENDOR, UsbBackend, UsbPipe
 
-from escape_drivers.pi.modulator import PiModulator, make_modulator
+from escape_drivers.pi.modulator import PiModulator
 from escape_drivers.pi.transports import SerialTransport, UsbTransport
 from escape_hw.config.loader import load_system
+from escape_hw.config.registry import DeviceContext
 from escape_hw.config.system import SystemConfig
 from escape_hw.testing import Check, Factory, parametrize_device_checks
 from escape_sim.emulators.e727.controller import E727Controller
@@ -42,13 +43,14 @@ class PtyTransport(SerialTransport):
 
 
 def over_tcp() -> PiModulator:
-    return make_modulator("modulator", configuration(), {})
+    config = configuration()
+    return PiModulator.from_section(config.devices.modulator, DeviceContext("modulator", config))
 
 
 def with_wire(connect: Callable[[], SerialTransport | UsbTransport]) -> PiModulator:
     section = configuration().devices.modulator
     assert section is not None
-    return PiModulator("modulator", section, connect)
+    return PiModulator("SIMMOD", stage=section.stage, max_tilt_rad=section.max_tilt_rad, connect=connect)
 
 
 def over_serial() -> PiModulator:

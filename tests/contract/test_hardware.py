@@ -7,7 +7,7 @@ from functools import partial
 import pytest
 from hardware_option import CHOSEN
 
-from escape_hw.config.registry import device_factory
+from escape_hw.config.registry import DeviceContext, device_factory
 from escape_hw.testing import Check, Factory, checks_for
 
 
@@ -21,8 +21,9 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     most = metafunc.config.getoption("--maxchange")
     cases = []
     for key in keys:
-        driver = getattr(configuration.devices, key).driver
-        factory = partial(device_factory(driver, hardware=True), key, configuration, {})
+        section = getattr(configuration.devices, key)
+        make = device_factory(section.driver, hardware=True)
+        factory = partial(make, section, DeviceContext(key, configuration))
         for check in checks_for(factory(), most):
             cases.append(pytest.param(factory, check, id=f"{key}-{check.__name__.removeprefix('check_')}"))
     metafunc.parametrize(("factory", "check"), cases)

@@ -7,6 +7,7 @@ from typing import Any
 
 from escape_hw.api.modulator import Modulation
 from escape_hw.config.loader import load_system
+from escape_hw.config.registry import DeviceContext
 from escape_hw.config.system import SystemConfig
 from escape_hw.testing import Check, Factory, parametrize_device_checks
 from escape_sim.devices import twins
@@ -19,19 +20,19 @@ def configuration(system: str) -> SystemConfig:
 
 def fresh(make: Any, name: str, system: str = "razor-shwfs") -> Any:
     """Make a device with a bench of its own."""
-    return make(name, configuration(system), {})
+    return make(None, DeviceContext(name, configuration(system)))
 
 
 def triggered_camera() -> Any:
     """Make the camera of a bench whose modulator runs."""
     shared: dict[str, object] = {}
     config = configuration("razor-pywfs")
-    with twins.make_modulator("modulator", config, shared) as stage:
+    with twins.make_modulator(None, DeviceContext("modulator", config, shared)) as stage:
         modulation = stage.modulate(Modulation(1.4e-4, 303.0))
     bench = twins.shared_bench(config, shared)
     bench.beam_path.modulation = modulation
     bench.plates.inserted = False
-    return twins.make_wfs_camera("wfs", config, shared)
+    return twins.make_wfs_camera(None, DeviceContext("wfs", config, shared))
 
 
 TWINS: dict[str, Factory] = {

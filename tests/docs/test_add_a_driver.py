@@ -11,6 +11,7 @@ import escape_hw.api.adaptive_secondary
 import escape_hw.api.camera
 import escape_hw.api.mirror
 import escape_hw.api.modulator
+import escape_hw.api.phase_screen
 
 PAGE = (Path(__file__).parents[2] / "docs" / "devices" / "add-a-driver.md").read_text(encoding="utf-8")
 
@@ -22,6 +23,7 @@ PAGE = (Path(__file__).parents[2] / "docs" / "devices" / "add-a-driver.md").read
         escape_hw.api.adaptive_secondary.AdaptiveSecondary,
         escape_hw.api.camera.Camera,
         escape_hw.api.modulator.TipTiltModulator,
+        escape_hw.api.phase_screen.PhaseScreen,
     ],
 )
 def test_the_hooks_to_fill_in_are_those_that_are_abstract(kind: type) -> None:

@@ -61,15 +61,16 @@ class Peers:
             f'devices.modulator.stage.correction_source="{correct}"',
             "devices.modulator.stage.settle_s=0.5",
         ]
-        overrides.append(f"devices.modulator.wire.timeout_s={TIMEOUT_S}")
         section = load_system("razor-pywfs", overrides=overrides).devices.modulator
         assert section is not None
         self.section = section
 
     def driver(self) -> PiModulator:
         return PiModulator(
-            "stage", self.section, lambda: Pipe(self.controller, self.wire), lambda s: time.sleep(s / HURRY)
-        )
+            "SIMMOD", name="stage", stage=self.section.stage, max_tilt_rad=self.section.max_tilt_rad,
+            connect=lambda: Pipe(self.controller, self.wire), sleep=lambda s: time.sleep(s / HURRY),
+            timeout_s=TIMEOUT_S,
+        )  # fmt: skip
 
     @property
     def condition(self) -> str:

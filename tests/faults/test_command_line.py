@@ -183,12 +183,12 @@ def test_a_failed_camera_and_a_lost_mirror_exit_3(run, system, im, tmp_path, mon
     monkeypatch.setattr(registry, "_REGISTERED", {})
     opened = []
 
-    def dying_camera(name, config, shared):
-        opened.append(shared)
-        return FaultyCamera(devices.make_wfs_camera(name, config, shared), stall_from=60)
+    def dying_camera(section, context):
+        opened.append(context.shared)
+        return FaultyCamera(devices.make_wfs_camera(section, context), stall_from=60)
 
-    def dying_mirror(name, config, shared):
-        return FaultyMirror(devices.make_mirror(name, config, shared), lost_from=20)
+    def dying_mirror(section, context):
+        return FaultyMirror(devices.make_mirror(section, context), lost_from=20)
 
     register_device("dying-camera", dying_camera)
     register_device("dying-mirror", dying_mirror)

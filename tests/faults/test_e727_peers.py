@@ -12,9 +12,10 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from escape_drivers.pi.modulator import PiModulator, make_modulator
+from escape_drivers.pi.modulator import PiModulator
 from escape_hw.api.modulator import Modulation
 from escape_hw.config.loader import load_system
+from escape_hw.config.registry import DeviceContext
 from escape_hw.errors import DeviceLost
 
 ESCAPE = (sys.executable, "-c", "from escape_hw.cli import main; main()")
@@ -28,7 +29,8 @@ def driver(port: int, *overrides: str) -> PiModulator:
         'devices.modulator.wire.host="127.0.0.1"', f"devices.modulator.wire.port={port}",
         f"devices.modulator.wire.timeout_s={TIMEOUT_S}", f"devices.modulator.wire.connect_s={TIMEOUT_S}",
     ]  # fmt: skip
-    return make_modulator("stage", load_system("razor-pywfs", overrides=[*wire, *overrides]), {})
+    config = load_system("razor-pywfs", overrides=[*wire, *overrides])
+    return PiModulator.from_section(config.devices.modulator, DeviceContext("stage", config))
 
 
 def lost_in_time(call: Callable[[], object], says: str) -> None:

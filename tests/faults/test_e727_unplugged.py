@@ -23,9 +23,9 @@ LONGEST_S = 10.0
 
 
 def stage(transport) -> PiModulator:
-    section = load_system("razor-pywfs", overrides=["devices.modulator.wire.timeout_s=0.2"]).devices.modulator
+    section = load_system("razor-pywfs").devices.modulator
     assert section is not None
-    return PiModulator("stage", section, lambda: transport)
+    return PiModulator("SIMMOD", name="stage", stage=section.stage, connect=lambda: transport, timeout_s=0.2)
 
 
 def controller() -> E727Controller:

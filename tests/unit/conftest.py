@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import json
-
 import fake_bench
 import fake_results as fake
 import pytest
+from command_line import document, escape
 
-from escape_hw.cli import main
 from escape_hw.io.fits.matrix import save_matrix
 from escape_hw.report.figures import style
 from escape_hw.report.run_report import REPORT, write_report
+
+__all__ = ["bench", "document", "empty_reports", "escape", "im", "pictures", "reports"]
 
 PNG = style.png
 
@@ -48,31 +48,6 @@ def pictures(bench, monkeypatch):
 def empty_reports(bench, monkeypatch):
     """Pages without content where the reports would be."""
     monkeypatch.setattr("escape_hw.runtime.procedures.products.write_report", empty_report)
-
-
-@pytest.fixture
-def escape(capsys):
-    """Run the command; returns exit code, standard output and standard error."""
-
-    def call(*words: object) -> tuple[int, str, str]:
-        capsys.readouterr()
-        with pytest.raises(SystemExit) as ended:
-            main([str(word) for word in words])
-        out, err = capsys.readouterr()
-        return ended.value.code or 0, out, err
-
-    return call
-
-
-@pytest.fixture
-def document(escape):
-    """Run with ``--json``: exit code, the only document, standard error."""
-
-    def call(*words: object) -> tuple[int, dict, str]:
-        code, out, err = escape(*words, "--json")
-        return code, json.loads(out, parse_constant=pytest.fail), err
-
-    return call
 
 
 @pytest.fixture

@@ -29,6 +29,8 @@ def static_breaches(lim: MirrorLimits, shape: NDArray[np.float64]) -> list[str]:
         broken.append("stroke")
     if any(shape[i] != 0 for i in lim.disabled):
         broken.append("disabled")
+    if lim.max_abs_sum is not None and np.abs(shape).sum() > lim.max_abs_sum + ROUNDING:
+        broken.append("sum")
     if lim.max_mean is not None and enabled and abs(np.mean(shape[enabled])) > lim.max_mean + ROUNDING:
         broken.append("mean")
     if lim.max_neighbour is not None:

@@ -16,6 +16,7 @@ from escape_hw.api.phase_screen import PhaseScreen, ScreenInfo, ScreenState
 from escape_hw.api.procedure import Procedure, Progress
 from escape_hw.bench import Bench
 from escape_hw.config.loader import load_system
+from escape_hw.config.registry import DeviceContext
 from escape_hw.config.system import SystemConfig
 from escape_hw.errors import Aborted, ConfigError, DeviceError, DeviceLost
 
@@ -139,11 +140,12 @@ def diary(monkeypatch: pytest.MonkeyPatch) -> Diary:
         if kind is None:
             raise ConfigError(f"no device driver '{driver}' is installed")
 
-        def make(name: str, config: SystemConfig, shared: dict[str, object]) -> object:
-            device = kind(name, config, diary, driver.startswith("sim-"))
-            members = shared.setdefault("members", [])
+        def make(section: object, context: DeviceContext) -> object:
+            assert section is getattr(context.require_system().devices, context.name)
+            device = kind(context.name, context.system, diary, driver.startswith("sim-"))
+            members = context.shared.setdefault("members", [])
             assert isinstance(members, list)
-            members.append(name)
+            members.append(context.name)
             diary.members = members
             return device
 

@@ -18,6 +18,7 @@ from escape_hw.api.modulator import TipTiltModulator
 from escape_hw.api.phase_screen import PhaseScreen
 from escape_hw.bench import build_device
 from escape_hw.config.loader import load_system, load_text
+from escape_hw.config.registry import DeviceContext
 from escape_hw.errors import ConfigError
 
 
@@ -58,6 +59,11 @@ def test_the_tilt_follows_from_the_beam():
         load_system("razor-pywfs", overrides=["devices.modulator.beam_m=3e-3"])
 
 
+def transport_of(config):
+    section = config.devices.modulator
+    return make_transport(section.wire, section.serial, section.options, DeviceContext("modulator", config))
+
+
 @pytest.mark.parametrize(
     ("kind", "transport"),
     [
@@ -70,7 +76,7 @@ def test_the_tilt_follows_from_the_beam():
 def test_the_wire_is_the_configured_one_and_connects_to_nothing(kind, transport):
     config = load_system("razor-pywfs", overrides=[f"devices.modulator.wire.kind={kind}"])
     assert config.devices.modulator is not None
-    assert type(make_transport(config.devices.modulator, config, {})) is transport
+    assert type(transport_of(config)) is transport
 
 
 def test_options_that_are_not_read_are_refused():
@@ -79,17 +85,17 @@ def test_options_that_are_not_read_are_refused():
     with pytest.raises(
         ConfigError, match=r"devices\.modulator\.options: zeroed: read with wire\.kind = 'emulator'"
     ):
-        make_transport(config.devices.modulator, config, {})
+        transport_of(config)
 
 
 def test_the_environment_goes_before_the_wire(monkeypatch):
     config = load_system("razor-pywfs", overrides=["devices.modulator.wire.kind=serial"])
     assert config.devices.modulator is not None
     monkeypatch.setenv("ESCAPE_E727", "127.0.0.1:4711")
-    assert make_transport(config.devices.modulator, config, {}).where == "127.0.0.1:4711"
+    assert transport_of(config).where == "127.0.0.1:4711"
     monkeypatch.setenv("ESCAPE_E727", "here")
     with pytest.raises(ConfigError, match="ESCAPE_E727=here: write HOST:PORT"):
-        make_transport(config.devices.modulator, config, {})
+        transport_of(config)
 
 
 def test_one_device_is_built_alone():

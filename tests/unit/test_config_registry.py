@@ -10,29 +10,45 @@ import pytest
 from escape_hw.bench import Bench
 from escape_hw.config import registry
 from escape_hw.config.loader import load_system
+from escape_hw.deprecation import RenamedWarning
 from escape_hw.errors import ConfigError
 
 FACTORY_SOURCE = """
-def make(name, config, shared):
-    return name
+def make(section, context):
+    return context.name
+
+
+def of_0_1_0(name, config, shared):
+    return f"{name} of {config.system.name}"
 
 LIMIT = 3
 
 
-def too_few(name, config):
-    return name
+def too_few(section):
+    return section
 
 
-def fails(name, config, shared):
-    return config.no_such_key
+def fails(section, context):
+    return section.no_such_key
 
 
-def forgets(name, config, shared):
+def forgets(section, context):
     pass
 
 
 def model(config):
     return config
+
+
+def no_model(config, grid):
+    return config
+
+
+from escape_hw import DeformableMirror
+
+
+class Halfway(DeformableMirror):
+    pass
 """
 
 
@@ -52,13 +68,15 @@ def plug(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         "plug-typo = plug_mirror:mkae\n"
         "plug-gone = plug_gone.devices:make\n"
         "plug-few = plug_mirror:too_few\n"
+        "plug-old = plug_mirror:of_0_1_0\n"
+        "plug-class = plug_mirror:Halfway\n"
         "plug-fails = plug_mirror:fails\n"
         "plug-forgets = plug_mirror:forgets\n"
         "plug-needy = plug_needy:make\n"
         "plug-extra = plug_needy:make [vendor]\n"
         "[escape.models]\n"
         "plug-model = plug_mirror:model\n"
-        "plug-none = plug_mirror:too_few\n"
+        "plug-none = plug_mirror:no_model\n"
     )
     for module in ("plug_mirror", "plug_needy"):
         monkeypatch.delitem(sys.modules, module, raising=False)
@@ -69,7 +87,26 @@ def test_a_third_party_driver_is_found_by_its_entry_point() -> None:
     assert "plug-mirror" in registry.available(registry.DEVICES)
     assert "plug-mirror" not in registry.available(registry.MODELS)
     factory = registry.device_factory("plug-mirror")
-    assert str(factory("dm", load_system("razor-shwfs"), {})) == "dm"
+    assert str(factory(None, registry.DeviceContext("dm"))) == "dm"
+
+
+@pytest.mark.usefixtures("plug")
+def test_a_factory_of_version_0_1_0_works_with_a_warning() -> None:
+    with pytest.warns(RenamedWarning, match=r"'plug-old' of plug: .* takes \(name, config, shared\); "):
+        factory = registry.device_factory("plug-old")
+    context = registry.DeviceContext("dm", load_system("razor-shwfs"))
+    assert str(factory(None, context)) == "dm of razor-shwfs"
+    with pytest.raises(ConfigError, match="dm: is part of a system and cannot be opened alone"):
+        factory(None, registry.DeviceContext("dm"))
+
+
+@pytest.mark.usefixtures("plug")
+def test_a_function_and_a_twin_are_not_opened_alone() -> None:
+    for name in ("plug-mirror", "sim-alpao"):
+        with pytest.raises(ConfigError, match=f"'{name}' works as a part of a system only; open the system"):
+            registry.device_class(name)
+    with pytest.raises(ConfigError, match=r"no driver for real hardware 'alpaka' .*did you mean 'alpao'"):
+        registry.device_class("alpaka")
 
 
 @pytest.mark.usefixtures("plug")
@@ -80,8 +117,12 @@ def test_a_third_party_driver_is_found_by_its_entry_point() -> None:
         ("plug-number", r"device driver 'plug-number' of plug is broken: plug_mirror:LIMIT is not callable"),
         (
             "plug-few",
-            r"'plug-few' of plug is broken: plug_mirror:too_few takes \(name, config\) \(too many positional "
-            r"arguments\); it is called as factory\(name, config, shared\)",
+            r"'plug-few' of plug is broken: plug_mirror:too_few takes \(section\) \(too many positional "
+            r"arguments\); it is called as factory\(section, context\)",
+        ),
+        (
+            "plug-class",
+            r"'plug-class' of plug is broken: .*:Halfway has no class method from_section\(",
         ),
         ("plug-typo", r"device driver 'plug-typo' of plug is broken: plug_mirror:mkae does not exist"),
         ("plug-gone", r"module plug_gone\.devices is not installed .* pip install --force-reinstall plug$"),
@@ -131,7 +172,7 @@ def test_a_broken_model_is_named_with_what_is_expected() -> None:
 @pytest.mark.parametrize("factory", [3, lambda name: name])
 def test_what_is_no_factory_is_not_registered(monkeypatch: pytest.MonkeyPatch, factory: object) -> None:
     monkeypatch.setattr(registry, "_REGISTERED", {})
-    with pytest.raises(ConfigError, match=r"'bench-mirror' is broken: .* factory\(name, config, shared"):
+    with pytest.raises(ConfigError, match=r"'bench-mirror' is broken: .* factory\(section, context"):
         registry.register_device("bench-mirror", factory)  # type: ignore[arg-type]
 
 
@@ -170,7 +211,7 @@ def test_a_script_may_register_a_driver_of_its_own(monkeypatch: pytest.MonkeyPat
     with pytest.raises(ConfigError, match="no device driver 'bench-mirror' is installed"):
         registry.device_factory("bench-mirror")
     for number in (1, 2):
-        factory = lambda name, config, shared, number=number: number  # noqa: E731
+        factory = lambda section, context, number=number: number  # noqa: E731
         registry.register_device("bench-mirror", factory)
         assert registry.device_factory("bench-mirror") is factory
     assert "bench-mirror" in registry.available(registry.DEVICES)

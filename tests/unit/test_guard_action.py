@@ -60,6 +60,10 @@ def test_report_states_what_was_done() -> None:
     assert report.scale == pytest.approx(0.25)
     np.testing.assert_allclose(safe, 0.25 * steep)
 
+    safe, report = guard_with(MirrorLimits(max_abs_sum=0.1 * N))(np.full(N, -0.4))
+    assert (report.scale, report.clipped) == (pytest.approx(0.25), 0)
+    np.testing.assert_allclose(safe, -0.1)
+
 
 def test_one_actuator_far_away_does_not_hold_the_others_back() -> None:
     command = np.full(N, 0.05)
@@ -108,6 +112,7 @@ def test_an_absurd_piston_keeps_its_sign(sign: float) -> None:
         (MirrorLimits(disabled=(6,)), 0.1 * np.eye(N)[6], "actuator 6 is disabled"),
         (MirrorLimits(max_mean=0.1), np.full(N, 0.2), "max_mean = 0.1"),
         (MirrorLimits(max_neighbour=0.1), 0.2 * np.eye(N)[6], "max_neighbour = 0.1"),
+        (MirrorLimits(max_abs_sum=1.0), np.full(N, 0.2), "sum of magnitudes exceeds max_abs_sum = 1.0"),
     ],
 )
 def test_breach_names_the_rule(limits: MirrorLimits, shape: NDArray[np.float64], words: str) -> None:

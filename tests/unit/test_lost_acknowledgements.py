@@ -23,6 +23,7 @@ LIMITS = st.builds(
     max_slew=st.floats(0.01, 1.0),
     max_neighbour=st.none() | st.floats(0.01, 1.0),
     max_mean=st.none() | st.floats(0.01, 1.0),
+    max_abs_sum=st.none() | st.floats(0.5, 20.0),
     disabled=st.lists(st.integers(0, N - 1), max_size=5).map(tuple),
 )
 

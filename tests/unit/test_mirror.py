@@ -84,6 +84,7 @@ def test_flatten_after_reopening_sends_again() -> None:
         max_slew=st.none() | st.floats(1e-3, 1.0),
         max_neighbour=st.none() | st.floats(0.01, 1.0),
         max_mean=st.none() | st.floats(0.01, 1.0),
+        max_abs_sum=st.none() | st.floats(0.5, 20.0),
         disabled=st.lists(st.integers(0, N - 1), max_size=5).map(tuple),
     ),
     seed=st.integers(0, 2**32 - 1),

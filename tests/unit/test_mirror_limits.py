@@ -28,6 +28,7 @@ def test_actuators_that_do_not_exist_are_refused() -> None:
         ({"max_slew": 0.0}, "max_slew is 0.0"),
         ({"max_neighbour": -1.0}, "max_neighbour is -1.0"),
         ({"max_mean": np.nan}, "max_mean is nan"),
+        ({"max_abs_sum": 0.0}, "max_abs_sum is 0.0"),
         ({"disabled": (-1,)}, "counted from 0"),
         ({"disabled": (0.5,)}, "whole numbers"),
     ],

@@ -9,6 +9,7 @@ import pytest
 
 from escape_hw.api.modulator import Modulation
 from escape_hw.config.loader import load_system
+from escape_hw.config.registry import DeviceContext
 from escape_hw.errors import ConfigError, SettingRejected
 from escape_sim.devices.twins import make_modulator
 from escape_sim.optics.modulation import BeamPath
@@ -24,7 +25,7 @@ def circle(*overrides: str) -> BeamPath:
 
 
 def test_a_cycle_is_a_whole_number_of_servo_steps() -> None:
-    stage = make_modulator("stage", load_system("razor-pywfs"), {})
+    stage = make_modulator(None, DeviceContext("stage", load_system("razor-pywfs")))
     with stage:
         for asked, steps in ((303.03, 66), (300.0, 67), (500.0, 40), (0.5, 40_000)):
             assert stage.check(Modulation(RADIUS, asked)).frequency_hz == pytest.approx(1 / (steps * 50e-6))
@@ -34,7 +35,7 @@ def test_a_cycle_is_a_whole_number_of_servo_steps() -> None:
 
 
 def test_starting_takes_time_and_the_commanded_modulation_is_reported() -> None:
-    with make_modulator("stage", load_system("razor-pywfs"), {}) as stage:
+    with make_modulator(None, DeviceContext("stage", load_system("razor-pywfs"))) as stage:
         before = stage.now_ns()
         reached = stage.modulate(Modulation(RADIUS, 303.03, (1e-5, 0.0)))
         assert stage.now_ns() - before == pytest.approx(0.2e9)
@@ -46,7 +47,7 @@ def test_starting_takes_time_and_the_commanded_modulation_is_reported() -> None:
 
 def test_a_system_without_a_modulator_has_no_twin_of_one() -> None:
     with pytest.raises(ConfigError, match=r"no \[devices.modulator\] section"):
-        make_modulator("stage", load_system("razor-shwfs"), {})
+        make_modulator(None, DeviceContext("stage", load_system("razor-shwfs")))
 
 
 def test_circle_is_the_requested_one_when_nothing_is_wrong() -> None:

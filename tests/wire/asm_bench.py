@@ -13,9 +13,11 @@ from typing import Any
 
 import pytest
 
-from escape_drivers.asm.mirror import AsmMirror, make_asm
+from escape_drivers.asm.mirror import AsmMirror
 from escape_hw.api.emulator import EmulatorRequest
 from escape_hw.config.loader import load_system
+from escape_hw.config.registry import DeviceContext
+from escape_hw.config.system import SystemConfig
 from escape_sim.emulators.asm import protocol as asm_wire
 from escape_sim.emulators.asm.emulator import AsmEmulator, make_emulator
 
@@ -36,7 +38,12 @@ def emulator(**options: object) -> Iterator[AsmEmulator]:
 def driver(port: int, *more: str, **options: Any) -> AsmMirror:
     """A mirror, not open, on the emulator's port; the options are those of its section."""
     chosen = {"port": port, "reply_s": 10.0, "heartbeat_s": 600.0, **options}
-    return make_asm("dm", _config(tuple(sorted(chosen.items())), more), {})
+    return as_driver(_config(tuple(sorted(chosen.items())), more))
+
+
+def as_driver(config: SystemConfig) -> AsmMirror:
+    """The mirror of a system, not open."""
+    return AsmMirror.from_section(config.devices.dm, DeviceContext("dm", config))
 
 
 @cache

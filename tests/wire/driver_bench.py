@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from escape_hw.config.loader import load_system
-from escape_hw.config.registry import device_factory
+from escape_hw.config.registry import DeviceContext, device_factory
 from escape_hw.config.system import SystemConfig
 from escape_sim.stand_ins import StandIn, StandInUnavailable
 
@@ -41,4 +41,5 @@ def make(driver: str, *more: str, system: str = "razor-shwfs") -> Any:
     path = stand_in(library).path
     chosen = (f'devices.{key}.driver="{driver}"', f'devices.{key}.options.library="{path}"')
     config = _configuration(system, (*chosen, *more))
-    return device_factory(driver, hardware=True)(key, config, {})
+    section = getattr(config.devices, key)
+    return device_factory(driver, hardware=True)(section, DeviceContext(key, config))

@@ -12,7 +12,7 @@ from escape_drivers.alpao.library import ERRORS, describe_error, format_version
 from escape_hw.config.registry import available
 from escape_hw.errors import CommandRejected, ConfigError, DeviceError, DeviceLost
 
-OPENING = ["asdkInit SIM97", "asdkGet NbOfActuator", "asdkGet VersionInfo"]
+OPENING = ["asdkInit SIM97", "asdkGet NbOfActuator", "asdkGet VersionInfo", "asdkSet TriggerIn 0"]
 CLOSING = ["asdkStop", "asdkReset", "asdkRelease"]
 
 
@@ -32,7 +32,7 @@ def test_every_call_of_a_session_in_order(asdk) -> None:
         assert asdk.calls == OPENING
         dm.send(command)
         assert np.array_equal(asdk.shape(97), command)
-    first, rest = asdk.calls[3], asdk.calls[4:]
+    first, rest = asdk.calls[4], asdk.calls[5:]
     assert first == f"asdkSend {command[0]:.17g} {command[1]:.17g} .. {command[-1]:.17g}"
     assert [line.partition(" ")[0] for line in rest[:-3]] == ["asdkSend"] * (len(rest) - 3)
     assert rest[-4].split()[1:] == ["0", "0", "..", "0"], "flat comes before the reset"
@@ -52,6 +52,35 @@ def test_options_become_parameters_in_units_of_the_sdk(asdk) -> None:
         assert asdk.calls[3:] == [
             "asdkSet SyncMode 1", "asdkSet AckTimeout 20", "asdkSet TriggerMode 1", "asdkSet TriggerIn 2",
         ]  # fmt: skip
+
+
+def test_a_trigger_that_another_program_left_on_is_switched_off(asdk) -> None:
+    asdk.script("set trigger_in 1")
+    with make("alpao") as dm:
+        dm.send(np.full(97, 0.01))
+        assert asdk.shape(97)[0] == 0.01
+    asdk.clear().script("set triggers 0")
+    with make("alpao") as dm:
+        dm.send(np.full(97, 0.01))
+    with pytest.raises(DeviceError, match=r"asdkSet\(TriggerIn, 1\) failed: error 0x10A.*take the option"):
+        make("alpao", "devices.dm.options.trigger_in=rising").open()
+    assert not asdk.violations
+
+
+def test_triggered_sequences_follow_each_other_and_closing_waits_for_no_edge(asdk) -> None:
+    rows = np.zeros((3, 97))
+    rows[1] = 0.01
+    with make("alpao", "devices.dm.options.trigger_in=rising") as dm:
+        for _ in range(3):
+            dm.play_patterns(rows)
+        played = [line for line in asdk.calls if line.startswith(("asdkSendPattern", "asdkSet", "asdkStop"))]
+        again = ["asdkStop ", "asdkSet TriggerIn 0", "asdkSet TriggerIn 1", "asdkSendPattern 3 1"]
+        assert [line.rstrip() for line in played[-8:]] == [line.rstrip() for line in again] * 2
+        with pytest.raises(DeviceError, match=r"0x10E, no trigger in time"):
+            dm.send(rows[1])
+    assert asdk.names()[-3:] == CLOSING
+    assert not asdk.shape(97).any()
+    assert not asdk.violations
 
 
 def test_the_serial_number_goes_out_in_capitals(asdk) -> None:
@@ -154,9 +183,9 @@ def test_patterns_reach_the_electronics_and_stop_before_anything_else(asdk) -> N
         dm.play_patterns(wave, repeats=0)
         assert dm._playing
         dm.play_patterns(wave, repeats=3)
-        assert asdk.calls[3:] == ["asdkSendPattern 8 0", "asdkStop", "asdkSendPattern 8 3"]
+        assert asdk.calls[4:] == ["asdkSendPattern 8 0", "asdkStop", "asdkSendPattern 8 3"]
         dm.send(np.zeros(97))
-        assert asdk.names()[6:] == ["asdkStop", "asdkSend"]
+        assert asdk.names()[7:] == ["asdkStop", "asdkSend"]
         assert not dm._playing
         dm.play_patterns(wave, repeats=0)
     assert asdk.names()[-5:] == ["asdkStop", "asdkSend", "asdkStop", "asdkReset", "asdkRelease"]

@@ -9,13 +9,12 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from asm_bench import driver, emulator, port_of, wait_for
+from asm_bench import as_driver, driver, emulator, port_of, wait_for
 
 from escape_drivers.asm import messages as m
 from escape_drivers.asm.codec import AsmCodec
-from escape_drivers.asm.mirror import AsmMirror, make_asm
+from escape_drivers.asm.mirror import AsmMirror
 from escape_drivers.asm.observer import AsmObserver
-from escape_drivers.asm.options import AsmOptions
 from escape_hw.api.adaptive_secondary import ShellState
 from escape_hw.config.loader import load_system
 from escape_hw.errors import ConfigError, DeviceError, FrameTimeout, SettingRejected
@@ -43,7 +42,7 @@ def on_the_wire() -> AsmMirror:
 
 def on_the_twin() -> AsmMirror:
     words = ["devices.dm.mode=hardware", "devices.dm.options.host=emulator"]
-    return make_asm("dm", load_system("maps-nir", overrides=words), {})
+    return as_driver(load_system("maps-nir", overrides=words))
 
 
 @parametrize_device_checks({"asm": on_the_wire})
@@ -243,7 +242,7 @@ def test_new_contamination_is_reported_with_the_line_to_configure() -> None:
 def test_wrong_options_are_refused(word: str, message: str) -> None:
     config = load_system("maps-nir", overrides=[f"devices.dm.options.{word}"])
     with pytest.raises(ConfigError, match=message):
-        make_asm("dm", config, {})
+        as_driver(config)
 
 
 def test_a_version_that_the_mirror_does_not_speak_is_named() -> None:
@@ -259,11 +258,8 @@ def test_another_codec_replaces_only_the_codec() -> None:
             super().__init__()
             type(self).made += 1
 
-    with emulator() as made:
-        section = load_system("maps-nir").devices.dm
-        options = AsmOptions(port=port_of(made))
-        with AsmMirror("dm", section, options, make_codec=Counting) as mirror:
-            mirror.send(np.zeros(336))
+    with emulator() as made, AsmMirror("SIM336", port=port_of(made), make_codec=Counting) as mirror:
+        mirror.send(np.zeros(336))
     assert Counting.made >= 1
 
 

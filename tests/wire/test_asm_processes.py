@@ -23,9 +23,10 @@ _ESCAPE = [sys.executable, "-c", "from escape_hw.cli import main; main()"]
 _CLIENT = """
 import sys, time
 from escape_hw.config.loader import load_system
-from escape_drivers.asm.mirror import make_asm
+from escape_hw.bench import build_device
+from escape_drivers.asm import AsmMirror
 words = ["devices.dm.mode=hardware", "devices.dm.options.port=" + sys.argv[1]]
-mirror = make_asm("dm", load_system("maps-nir", overrides=words), {}).open()
+mirror = build_device("dm", load_system("maps-nir", overrides=words), AsmMirror).open()
 print(mirror.state, flush=True)
 time.sleep(600)
 """

@@ -19,9 +19,10 @@ def test_nothing_is_loaded_before_open(driver: str, key: str) -> None:
         "import sys, ctypes\n"
         "ctypes.CDLL = lambda *a, **k: sys.exit('a library was loaded')\n"
         "from escape_hw.config.loader import load_system\n"
-        "from escape_hw.config.registry import device_factory\n"
+        "from escape_hw.config.registry import DeviceContext, device_factory\n"
         "config = load_system('razor-shwfs', mode='hardware')\n"
-        f"print(device_factory({driver!r}, hardware=True)({key!r}, config, {{}}).is_open)"
+        f"make = device_factory({driver!r}, hardware=True)\n"
+        f"print(make(config.devices.{key}, DeviceContext({key!r}, config)).is_open)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
     assert done.stdout == "False\n", done.stderr

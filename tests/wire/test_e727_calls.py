@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 from usb_bus import pulses_s
 
-from escape_drivers.pi.modulator import PiModulator, make_modulator
+from escape_drivers.pi.modulator import PiModulator
 from escape_hw.api.emulator import EmulatorRequest
 from escape_hw.api.modulator import Modulation
 from escape_hw.config.loader import load_system
+from escape_hw.config.registry import DeviceContext
 from escape_hw.errors import DeviceError, DeviceLost, SettingRejected
 from escape_sim.emulators.e727.emulator import E727Emulator, make_emulator
 
@@ -30,7 +31,8 @@ def emulator():
 
 def driver(emulator: E727Emulator, *overrides: str) -> PiModulator:
     wire = ['devices.modulator.wire.host="127.0.0.1"', f"devices.modulator.wire.port={emulator.server.port}"]
-    return make_modulator("stage", load_system("razor-pywfs", overrides=[*wire, *overrides]), {})
+    config = load_system("razor-pywfs", overrides=[*wire, *overrides])
+    return PiModulator.from_section(config.devices.modulator, DeviceContext("stage", config))
 
 
 def said(emulator: E727Emulator, since: int = 0) -> list[str]:

@@ -25,8 +25,9 @@ _ENGINE = """
 import sys, time
 import numpy as np
 from escape_hw.config.loader import load_text
-from escape_drivers.asm.mirror import make_asm
-mirror = make_asm("dm", load_text(open(sys.argv[1]).read()), {}).open()
+from escape_hw.bench import build_device
+from escape_drivers.asm import AsmMirror
+mirror = build_device("dm", load_text(open(sys.argv[1]).read()), AsmMirror).open()
 shape = np.zeros(336); shape[100] = 0.01
 mirror.send(shape)
 print("shaped", flush=True)

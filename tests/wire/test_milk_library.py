@@ -22,7 +22,7 @@ from milk_peer import CIRCULAR, Image, ramp
 from streams import SHAPE, camera_config, mirror_config
 
 from escape_hw.config.loader import load_system
-from escape_hw.config.registry import device_factory
+from escape_hw.config.registry import DeviceContext, device_factory
 from escape_hw.errors import ProductError
 from escape_hw.io.interchange.milk import layout
 from escape_hw.io.interchange.milk.stream import MilkStream
@@ -295,7 +295,7 @@ def test_another_version_is_opened_by_neither(library: Any, version: str) -> Non
 def test_a_camera_follows_what_the_library_writes_at_500_hz(library: Any) -> None:
     Image(library).create("camera", SHAPE, "u2")
     config = camera_config(load_system("razor-shwfs"), "camera")
-    camera: Any = device_factory("milk-camera")("wfs", config, {})
+    camera: Any = device_factory("milk-camera")(config.devices.wfs, DeviceContext("wfs", config))
     with another_process("write", "camera", 0.002, 2000) as said:
         assert said == "writing"
         with camera:
@@ -316,7 +316,7 @@ def test_a_mirror_writes_what_the_library_waits_for(library: Any) -> None:
     image = Image(library).create("dm", (11, 11), "f4")
     Image(library).create("seen", (11, 11), "f4")
     config = mirror_config(load_system("razor-shwfs"), "dm", scale=2.0)
-    mirror: Any = device_factory("milk-mirror")("dm", config, {})
+    mirror: Any = device_factory("milk-mirror")(config.devices.dm, DeviceContext("dm", config))
     there = config.devices.dm.actuator_map()
     seen = MilkStream.open("seen")
     generator = np.random.default_rng(4)

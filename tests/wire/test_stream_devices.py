@@ -15,7 +15,7 @@ import pytest
 from streams import SHAPE, camera_config, create, mirror_config, published, ramp
 
 from escape_hw.config.loader import load_system
-from escape_hw.config.registry import device_factory
+from escape_hw.config.registry import DeviceContext, device_factory
 from escape_hw.config.system import SystemConfig
 from escape_hw.errors import ConfigError, DeviceError, FrameTimeout
 from escape_hw.testing import Check, Factory, parametrize_device_checks
@@ -33,9 +33,13 @@ def make(kind: str, key: str, stream: str = "", **options: Any) -> Any:
     """A device on a stream, not open."""
     if key == "wfs":
         config = camera_config(configuration(), stream or f"{TAG}_camera")
-        return device_factory(f"{kind}-camera", hardware=True)(key, config, {})
+        return device_factory(f"{kind}-camera", hardware=True)(
+            getattr(config.devices, key), DeviceContext(key, config)
+        )
     config = mirror_config(configuration(), stream or f"{TAG}_mirror", **options)
-    return device_factory(f"{kind}-mirror", hardware=True)(key, config, {})
+    return device_factory(f"{kind}-mirror", hardware=True)(
+        getattr(config.devices, key), DeviceContext(key, config)
+    )
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -151,7 +155,7 @@ def test_signed_and_floating_streams_become_counts() -> None:
         frame[10, 20] = 5000
         config = camera_config(configuration(), name)
         config.devices.wfs.options["offset"] = 10.0
-        camera: Any = device_factory("milk-camera")("wfs", config, {})
+        camera: Any = device_factory("milk-camera")(config.devices.wfs, DeviceContext("wfs", config))
         with camera, published(stream, lambda _: frame):
             got = camera.next_frame(2.0)
             assert got.data[6, 12] == 1023

@@ -17,7 +17,6 @@ from escape_benchmarks.rows import time_row
 from escape_drivers.asm import messages as m
 from escape_drivers.asm.codec import HEADER_BYTES, AsmCodec
 from escape_drivers.asm.mirror import AsmMirror
-from escape_drivers.asm.options import AsmOptions
 from escape_hw.api.adaptive_secondary import STATE_ORDER
 from escape_hw.api.benchmark import BenchmarkRow, time_alternately
 from escape_hw.config.devices import MirrorConfig
@@ -33,7 +32,10 @@ def run() -> list[BenchmarkRow]:
     """Entry point ``asm`` of ``escape.benchmarks``."""
     section = load_system("maps-nir").devices.dm
     with _emulator() as ours, _emulator() as theirs:
-        mirror = AsmMirror("dm", section, AsmOptions(port=ours, heartbeat_s=60.0))
+        mirror = AsmMirror(
+            section.serial, layout=section.layout, stroke_m=section.stroke_m,
+            limits=section.limits.to_limits(), port=ours, heartbeat_s=60.0,
+        )  # fmt: skip
         with mirror, contextlib.closing(_BareSocketClient(theirs, section.n_act)) as bare_client:
             legal = np.full(section.n_act, 0.001)
             legal[list(section.limits.disabled)] = 0.0

@@ -14,8 +14,9 @@ import numpy as np
 
 from escape_benchmarks.rows import time_row
 from escape_hw.api.benchmark import BenchmarkRow, time_alternately
+from escape_hw.api.device import Device
+from escape_hw.bench import build_device
 from escape_hw.config.loader import load_system
-from escape_hw.config.registry import device_factory
 from escape_sim.stand_ins import StandIn, StandInUnavailable
 
 _IMAGE_BYTES = 288
@@ -33,7 +34,7 @@ def run() -> list[BenchmarkRow]:
 def _device(driver: str, key: str, library: StandIn) -> Any:
     chosen = f'devices.{key}.options.library="{library.path}"'
     config = load_system("razor-shwfs", mode="hardware", overrides=[chosen])
-    return device_factory(driver, hardware=True)(key, config, {})
+    return build_device(key, config, Device)  # type: ignore[type-abstract]
 
 
 def _mirror(asdk: StandIn) -> list[BenchmarkRow]:

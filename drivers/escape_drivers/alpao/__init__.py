@@ -1,4 +1,5 @@
-"""ALPAO deformable mirrors: the driver and the binding of the vendor's SDK.
+"""ALPAO deformable mirrors: the driver and the binding of the vendor's SDK."""
 
-Exports ``AlpaoMirror``, ``AlpaoOptions``.
-"""
+from escape_drivers.alpao.mirror import AlpaoMirror, AlpaoOptions
+
+__all__ = ["AlpaoMirror", "AlpaoOptions"]

@@ -15,6 +15,7 @@ from escape_hw.api.discovery import VendorLibrary
 from escape_hw.errors import DeviceError
 
 _CONFIGURATION_HINT = "its configuration files (serial number .acfg and binary) must lie where ACECFG points"
+_PATTERN_HINT = "after a triggered sequence, stop_pattern() first"
 _CABLE_HINT = "check power, cable and the interface's address"
 
 #: Number: what happened and, where one is known, the way out.
@@ -40,9 +41,9 @@ ERRORS: dict[int, tuple[str, str]] = {
     0x032: ("not supported yet", ""),
     0x100: ("a parameter is missing", ""),
     0x101: ("the interface is not connected", f"{_CABLE_HINT}, then open the mirror again"),
-    0x102: ("time-out of the output", _CABLE_HINT),
+    0x102: ("time-out of the output", f"{_CABLE_HINT}; {_PATTERN_HINT}"),
     0x103: ("time-out of the input", _CABLE_HINT),
-    0x104: ("output failed", _CABLE_HINT),
+    0x104: ("output failed", f"{_CABLE_HINT}; {_PATTERN_HINT}"),
     0x105: ("input failed", _CABLE_HINT),
     0x106: ("asynchronous output could not be checked", "stop the pattern first"),
     0x107: ("asynchronous input could not be checked", "stop the pattern first"),

@@ -3,25 +3,35 @@
 from __future__ import annotations
 
 import logging
+import math
 import os
 from collections.abc import Callable
 from ctypes import c_void_p
 from functools import partial
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
 from escape_drivers.alpao.library import AlpaoLibrary, format_version
-from escape_drivers.common.options import parse_options, require_serial
+from escape_drivers.common.options import (
+    layout_of,
+    mirror_settings,
+    parse_options,
+    require_serial,
+    section_options,
+)
 from escape_hw.api.mirror import DeformableMirror, DMInfo
+from escape_hw.config.actuator_layouts import n_actuators
+from escape_hw.config.devices import mirror_info
 from escape_hw.config.section import Section
-from escape_hw.errors import CommandRejected, DeviceError
+from escape_hw.errors import CommandRejected, DeviceError, DeviceLost, NotOpen
+from escape_hw.safety.limits import CAUTIOUS_LIMITS, MirrorLimits
 
 if TYPE_CHECKING:
     from escape_hw.config.devices import MirrorConfig
-    from escape_hw.config.system import SystemConfig
+    from escape_hw.config.registry import DeviceContext
 
 log = logging.getLogger(__name__)
 
@@ -33,7 +43,7 @@ _CONFIG_VARIABLE = "ACECFG"
 
 
 class AlpaoOptions(Section):
-    """The ``[devices.dm.options]`` of this driver; what is left at its default is not sent.
+    """The ``[devices.dm.options]`` of this driver; what is left at its default is not sent, but the trigger.
 
     Parameters
     ----------
@@ -46,7 +56,8 @@ class AlpaoOptions(Section):
     ack_timeout_ms
         Longest wait for the electronics' acknowledgement; 0: as the SDK has it.
     trigger_in
-        Wait for an edge before each shape.
+        Wait for an edge before each shape. Set at every opening, because the electronics keep what another
+        program left; empty: off, if the electronics have triggers.
     trigger_out
         Length of the pulse that goes out with each shape.
     """
@@ -67,37 +78,76 @@ class AlpaoOptions(Section):
             wanted.append(("AckTimeout", float(self.ack_timeout_ms)))
         if self.trigger_out:
             wanted.append(("TriggerMode", _TRIGGER_OUT[self.trigger_out]))
-        if self.trigger_in:
-            wanted.append(("TriggerIn", _TRIGGER_IN[self.trigger_in]))
         return wanted
 
-
-def make_mirror(name: str, config: SystemConfig, shared: dict[str, object]) -> AlpaoMirror:
-    """Entry point ``alpao``; raises ``ConfigError`` if the serial number is missing or an option is wrong."""
-    section = config.devices.dm
-    require_serial(name, section)
-    options = parse_options(AlpaoOptions, name, section)
-    return AlpaoMirror(name, section, options)
+    @property
+    def is_triggered(self) -> bool:
+        """Whether each shape waits for an edge."""
+        return self.trigger_in in ("rising", "falling")
 
 
 class AlpaoMirror(DeformableMirror):
-    """An ALPAO mirror. Closing ramps to flat, stops, resets and releases it, in this order."""
+    """An ALPAO mirror. Closing ramps to flat, stops, resets and releases it, in this order.
 
-    def __init__(self, name: str, section: MirrorConfig, options: AlpaoOptions) -> None:
-        super().__init__(name, section.limits.to_limits())
-        self._section, self._options = section, options
-        self._buffer = np.zeros(section.n_act)
-        # The buffer never moves, so its address is made once.
-        self._pointer = c_void_p(self._buffer.ctypes.data)
+    Parameters
+    ----------
+    serial
+        Serial number, such as ``"BAX118"``.
+    name
+        Name in messages.
+    layout
+        Arrangement of the actuators, see :mod:`escape_hw.config.actuator_layouts`; empty: by the number of
+        actuators, the only part of the geometry that the SDK reports.
+    pitch_m
+        Distance between actuators, metres.
+    stroke_m
+        Metres of surface at the actuator for a command of 1; NaN: not known.
+    limits
+        Limits of every command.
+    **options
+        Fields of :class:`AlpaoOptions`.
+
+    Raises
+    ------
+    ConfigError
+        The serial number is missing or an option is wrong.
+    """
+
+    def __init__(
+        self,
+        serial: str,
+        *,
+        name: str = "alpao",
+        layout: str = "",
+        pitch_m: float = 1.5e-3,
+        stroke_m: float = math.nan,
+        limits: MirrorLimits = CAUTIOUS_LIMITS,
+        **options: Any,
+    ) -> None:
+        super().__init__(name, limits)
+        self._serial, self._options = (
+            require_serial("serial", serial),
+            parse_options(AlpaoOptions, name, options),
+        )
+        self._layout, self._pitch_m, self._stroke_m = layout, pitch_m, stroke_m
+        self._buffer = np.empty(0)
         self._library: AlpaoLibrary | None = None
         self._handle: c_void_p | None = None
         self._transfer: Callable[[], int] = _raise_not_connected
         self._playing = False
-        self._info = self._build_info("ALPAO mirror", False)
+        self._info = self._build_info("ALPAO mirror", False) if layout else None
+
+    @classmethod
+    def from_section(cls, section: MirrorConfig, context: DeviceContext) -> Self:
+        """The mirror of ``[devices.dm]``; raises ``ConfigError`` as the class does."""
+        options = section_options(AlpaoOptions, context.name, section)
+        return cls(**mirror_settings(context.name, section), **options)
 
     @property
     def info(self) -> DMInfo:
-        """Identity and geometry."""
+        """Identity and geometry; ``NotOpen`` before ``open`` if no layout was given."""
+        if self._info is None:
+            raise NotOpen(self.name, "its number of actuators is known once it is open; call open() first")
         return self._info
 
     @property
@@ -137,6 +187,24 @@ class AlpaoMirror(DeformableMirror):
             library.call("asdkSendPattern", handle, pointer, len(sequence), repeats)
             self._guard_when_open().reset(sequence[-1])
 
+    def _set_trigger(self, library: AlpaoLibrary, handle: c_void_p, trigger_in: str) -> None:
+        """Set the trigger's edge; electronics without triggers need no "off"."""
+        try:
+            library.set(handle, "TriggerIn", _TRIGGER_IN[trigger_in])
+        except DeviceLost:
+            raise
+        except DeviceError as error:
+            if trigger_in != "off":
+                raise
+            log.debug("%s: has no trigger (%s)", self.name, error)
+
+    def _before_close(self) -> None:
+        """Without the trigger, so that the flat shape waits for no edge."""
+        library, handle = self._require_connected()
+        if self._options.is_triggered:
+            self._set_trigger(library, handle, "off")
+        super()._before_close()
+
     def stop_pattern(self) -> None:
         """Stop a sequence; the mirror keeps the shape it has. Does nothing when none runs."""
         with self._lock:
@@ -148,22 +216,26 @@ class AlpaoMirror(DeformableMirror):
             os.environ[_CONFIG_VARIABLE] = self._options.config_folder
         library = self._library = AlpaoLibrary(self.name, self._options.library)
         # Configuration files have names in capitals, and the SDK searches for capitals.
-        handle = self._handle = library.init(self._section.serial.strip().upper())
+        handle = self._handle = library.init(self._serial.upper())
         n_act = round(library.get(handle, "NbOfActuator"))
-        if n_act != self._section.n_act:
+        self._layout = layout = self._layout or layout_of(self.name, n_act)
+        if n_act != (wanted := n_actuators(layout)):
             raise DeviceError(
                 self.name,
-                f"has {n_act} actuators, but the layout {self._section.layout!r} has {self._section.n_act}; "
-                "correct devices.dm.layout or the serial number",
+                f"has {n_act} actuators, but the layout {layout!r} has {wanted}; "
+                f"correct devices.{self.name}.layout or the serial number",
             )
         version = format_version(library.get(handle, "VersionInfo"))
-        log.info("%s: SDK %s, mirror %s", self.name, version, self._section.serial)
+        log.info("%s: SDK %s, mirror %s", self.name, version, self._serial)
         for name, value in self._options.sdk_parameters():
             library.set(handle, name, value)
+        self._set_trigger(library, handle, self._options.trigger_in or "off")
         self._playing = False
         # A function object of its own without prototype: both arguments are C pointers for good already,
         # and checking them at every call costs as much as the call.
-        self._transfer = partial(library.c["asdkSend"], handle, self._pointer)
+        # The buffer never moves, so its address is made once.
+        self._buffer = np.zeros(n_act)
+        self._transfer = partial(library.c["asdkSend"], handle, c_void_p(self._buffer.ctypes.data))
         self._info = self._build_info(f"ALPAO mirror, SDK {version}", library.stand_in)
 
     def _close(self) -> None:
@@ -198,6 +270,10 @@ class AlpaoMirror(DeformableMirror):
         if self._playing:
             library.call("asdkStop", handle)
             self._playing = False
+            if self._options.is_triggered:
+                # Users report that a second triggered sequence fails (0x102, 0x104) without this.
+                self._set_trigger(library, handle, "off")
+                self._set_trigger(library, handle, self._options.trigger_in)
 
     def _validate_sequence(self, patterns: ArrayLike, repeats: int) -> NDArray[np.float64]:
         guard = self._guard_when_open()
@@ -225,8 +301,14 @@ class AlpaoMirror(DeformableMirror):
         return self._library, self._handle
 
     def _build_info(self, model: str, stand_in: bool) -> DMInfo:
-        name = f"{model} (stand-in)" if stand_in else model
-        return self._section.info(name, simulated=stand_in)
+        named = f"{model} (stand-in)" if stand_in else model
+        return mirror_info(
+            self._layout, self._pitch_m, self._stroke_m, named, self._serial, simulated=stand_in
+        )
+
+
+#: Name of the entry point in version 0.1.0, which an environment installed then still has.
+make_mirror = AlpaoMirror
 
 
 def _raise_not_connected() -> int:

@@ -1,1 +1,5 @@
-"""GenICam cameras through Aravis: the driver and the binding. Exports ``AravisCamera``, ``AravisOptions``."""
+"""GenICam cameras through Aravis: the driver and the binding."""
+
+from escape_drivers.aravis.camera import AravisCamera, AravisOptions
+
+__all__ = ["AravisCamera", "AravisOptions"]

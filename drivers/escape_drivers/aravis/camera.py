@@ -4,23 +4,24 @@ from __future__ import annotations
 
 import ctypes
 import logging
-from typing import TYPE_CHECKING, Any, Literal
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
 from escape_drivers.aravis.library import AravisLibrary, ReceivedBuffer
-from escape_drivers.common.camera import BlockingCamera
+from escape_drivers.common.camera import BlockingCamera, split_settings
 from escape_drivers.common.camera_limits import CameraLimits, ParameterRange
-from escape_drivers.common.options import camera_section, parse_options, require_serial
+from escape_drivers.common.options import camera_settings, section_options
 from escape_hw.api.camera import CameraSettings, Frame, Region
 from escape_hw.config.section import Section
 from escape_hw.errors import DeviceError, DeviceLost
 
 if TYPE_CHECKING:
     from escape_hw.config.devices import CameraConfig
-    from escape_hw.config.system import SystemConfig
+    from escape_hw.config.registry import DeviceContext
 
 log = logging.getLogger(__name__)
 
@@ -64,20 +65,39 @@ class AravisOptions(Section):
     newest: bool = False
 
 
-def make_camera(name: str, config: SystemConfig, shared: dict[str, object]) -> AravisCamera:
-    """Entry point ``aravis``; raises ``ConfigError`` if the serial number is missing or an option wrong."""
-    section = camera_section(name, config)
-    require_serial(name, section)
-    return AravisCamera(name, section, parse_options(AravisOptions, name, section))
-
-
 class AravisCamera(BlockingCamera[AravisLibrary]):
-    """A GenICam camera."""
+    """A GenICam camera.
 
-    def __init__(self, name: str, section: CameraConfig, options: AravisOptions) -> None:
-        super().__init__(name, section, "GenICam camera", _BLOCK_ID_RANGE)
+    Parameters
+    ----------
+    serial
+        Serial number.
+    name
+        Name in messages.
+    **settings
+        Fields of :class:`~escape_drivers.common.camera.CameraRequest` (``region``, ``exposure_s``,
+        ``frame_rate_hz``, ``gain_db``, ``bit_depth``; the size of the sensor is read from the camera) and of
+        :class:`AravisOptions`.
+
+    Raises
+    ------
+    ConfigError
+        The serial number is missing or an option is wrong.
+    """
+
+    def __init__(self, serial: str, *, name: str = "aravis", **settings: Any) -> None:
+        request, options = split_settings(name, serial, settings, AravisOptions)
+        if "bit_depth" not in settings:
+            request = replace(request, bit_depth=int(options.pixel_format.removeprefix("Mono")))
+        super().__init__(name, request, "GenICam camera", _BLOCK_ID_RANGE)
         self._options = options
         self._incomplete = 0
+
+    @classmethod
+    def from_section(cls, section: CameraConfig, context: DeviceContext) -> Self:
+        """The camera of a device section; raises ``ConfigError`` as the class does."""
+        options = section_options(AravisOptions, context.name, section)
+        return cls(**camera_settings(context.name, section), **options)
 
     @property
     def incomplete_frames(self) -> int:
@@ -86,7 +106,7 @@ class AravisCamera(BlockingCamera[AravisLibrary]):
 
     def _open(self) -> None:
         library = self._connection = AravisLibrary(self.name, self._options.library)
-        library.open(self._section.serial.strip(), self._options.interface)
+        library.open(self._request.serial, self._options.interface)
         model = (library.call("camera_get_model_name") or b"GenICam camera").decode(errors="replace")
         library.call("camera_set_pixel_format_from_string", self._options.pixel_format.encode())
         for feature in _AUTO_FEATURES:
@@ -96,12 +116,12 @@ class AravisCamera(BlockingCamera[AravisLibrary]):
         if switch is not None:
             library.call("camera_set_boolean", switch.encode(), 1)
         width, height = library.get_ints("camera_get_sensor_size", 2)
-        self._require_sensor((width, height), "to what the camera is")
+        self._adopt_sensor((width, height), "to what the camera is")
         library.call("camera_set_region", 0, 0, width, height)
         self._limits = _read_limits(library)
         self._info = self._build_info(model, library.stand_in or self._options.interface == "Fake")
-        log.info("%s: %s, serial number %s", self.name, model, self._section.serial)
-        self._settings = self._apply_settings(self._check(self._section.settings()))
+        log.info("%s: %s, serial number %s", self.name, model, self._request.serial)
+        self._settings = self._apply_settings(self._check(self._request.settings((width, height))))
 
     def _apply_settings(self, want: CameraSettings) -> CameraSettings:
         library, limits, region = self._require_connected(), self._require_limits(), want.region
@@ -198,6 +218,10 @@ class AravisCamera(BlockingCamera[AravisLibrary]):
             np.uint16, copy=False
         )
         return np.right_shift(counts, np.uint16(self._options.shift)) if self._options.shift else counts
+
+
+#: Name of the entry point in version 0.1.0, which an environment installed then still has.
+make_camera = AravisCamera
 
 
 def _read_limits(library: AravisLibrary) -> CameraLimits:

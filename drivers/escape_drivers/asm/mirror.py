@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import logging
+import math
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,40 +17,93 @@ from escape_drivers.asm.codec import AsmCodec
 from escape_drivers.asm.link import AsmLink, MirrorRefusal
 from escape_drivers.asm.messages import Welcome
 from escape_drivers.asm.options import EMULATOR, AsmOptions
-from escape_drivers.common.options import parse_options, require_serial
+from escape_drivers.common.options import (
+    layout_of,
+    mirror_settings,
+    parse_options,
+    require_serial,
+    section_options,
+)
 from escape_hw.api.adaptive_secondary import AdaptiveSecondary, ShellHealth, ShellState
 from escape_hw.api.emulator import Emulator, EmulatorRequest
 from escape_hw.api.mirror import DMInfo
+from escape_hw.config.actuator_layouts import n_actuators
+from escape_hw.config.devices import mirror_info
 from escape_hw.config.registry import emulator_factory
-from escape_hw.errors import DeviceError, SettingRejected
+from escape_hw.errors import DeviceError, NotOpen, SettingRejected
+from escape_hw.safety.limits import CAUTIOUS_LIMITS, MirrorLimits
 from escape_hw.supervision import BackgroundThread
 
 if TYPE_CHECKING:
     from escape_hw.config.devices import MirrorConfig
-    from escape_hw.config.system import SystemConfig
+    from escape_hw.config.registry import DeviceContext
 
 
 #: Head-room for the mirror's limits, which come as single-precision numbers.
 _ROUNDING = 1e-6
 
 
-def require_identity(name: str, section: MirrorConfig, welcome: Welcome) -> None:
+@dataclass(frozen=True, slots=True)
+class ExpectedMirror:
+    """The mirror that is meant, and the limits of its commands.
+
+    Parameters
+    ----------
+    serial
+        Serial number.
+    layout
+        Arrangement of the actuators; empty: by the number that the mirror reports.
+    pitch_m
+        Distance between actuators, metres.
+    stroke_m
+        Metres of surface for a command of 1; ``None``: the mirror's own largest command.
+    limits
+        Limits of every command; ``None``: :data:`CAUTIOUS_LIMITS
+        <escape_hw.safety.limits.CAUTIOUS_LIMITS>` within those that the mirror reports.
+    """
+
+    serial: str
+    layout: str = ""
+    pitch_m: float = 1.0
+    stroke_m: float | None = None
+    limits: MirrorLimits | None = None
+
+    def completed(self, name: str, welcome: Welcome) -> ExpectedMirror:
+        """What was left open, from the mirror's own report."""
+        stroke_m = welcome.max_command_m if self.stroke_m is None else self.stroke_m
+        limits = self.limits or replace(
+            CAUTIOUS_LIMITS,
+            max_stroke=min(CAUTIOUS_LIMITS.max_stroke, welcome.max_command_m / stroke_m),
+            max_slew=min(CAUTIOUS_LIMITS.max_slew or 2.0, welcome.max_step_m / stroke_m),
+            disabled=tuple(sorted(welcome.disabled)),
+        )
+        layout = self.layout or layout_of(name, welcome.last_command_m.size)
+        return replace(self, layout=layout, stroke_m=stroke_m, limits=limits)
+
+    def info(self, model: str, serial: str, *, simulated: bool) -> DMInfo:
+        """Identity and geometry; NaN for a stroke that is not known yet."""
+        stroke_m = math.nan if self.stroke_m is None else self.stroke_m
+        return mirror_info(self.layout, self.pitch_m, stroke_m, model, serial, simulated=simulated)
+
+
+def require_identity(name: str, expected: ExpectedMirror, welcome: Welcome) -> None:
     """Require the expected mirror; an observer needs no further checks."""
-    if welcome.last_command_m.size != section.n_act:
+    n_act = n_actuators(expected.layout)
+    if welcome.last_command_m.size != n_act:
         raise DeviceError(
             name,
-            f"has {welcome.last_command_m.size} actuators, devices.{name}.layout = '{section.layout}' has "
-            f"{section.n_act}; correct the layout or the address",
+            f"has {welcome.last_command_m.size} actuators, devices.{name}.layout = '{expected.layout}' has "
+            f"{n_act}; correct the layout or the address",
         )
-    if section.serial and section.serial != welcome.serial:
+    if expected.serial != welcome.serial:
         raise DeviceError(
             name,
-            f"is {welcome.serial!r}, not {section.serial!r}; correct devices.{name}.serial or the address",
+            f"is {welcome.serial!r}, not {expected.serial!r}; correct devices.{name}.serial or the address",
         )
 
 
-def require_compatible(name: str, section: MirrorConfig, welcome: Welcome) -> tuple[int, ...]:
-    """Require the mirror that was meant, and limits of ours that lie within its own.
+def require_compatible(name: str, limits: MirrorLimits, stroke_m: float, welcome: Welcome) -> tuple[int, ...]:
+    """Require limits of ours that lie within the mirror's own.
 
     Returns
     -------
@@ -61,12 +116,10 @@ def require_compatible(name: str, section: MirrorConfig, welcome: Welcome) -> tu
         A limit of ours exceeds the mirror's, or actuators are out of service that the configuration
         counts on.
     """
-    require_identity(name, section, welcome)
-    limits, stroke = section.limits, section.stroke_m
     slew = limits.max_slew if limits.max_slew is not None else 2 * limits.max_stroke
     for key, configured, reported in (
-        ("max_stroke", limits.max_stroke, welcome.max_command_m / stroke),
-        ("max_slew", slew, welcome.max_step_m / stroke),
+        ("max_stroke", limits.max_stroke, welcome.max_command_m / stroke_m),
+        ("max_slew", slew, welcome.max_step_m / stroke_m),
     ):
         if configured > reported * (1 + _ROUNDING):
             raise SettingRejected(
@@ -91,17 +144,6 @@ log = logging.getLogger(__name__)
 _STEP_POLL_S = 0.02
 
 
-def make_asm(name: str, config: SystemConfig, shared: dict[str, object]) -> AsmMirror:
-    """Entry point ``asm``; raises ``ConfigError`` if the serial number is missing or an option is wrong."""
-    section = config.devices.dm
-    require_serial(name, section)
-    options = parse_options(AsmOptions, name, section)
-    emulator = None
-    if options.host == EMULATOR:
-        emulator = emulator_factory("asm")(EmulatorRequest(port=0, shared=shared, config=config))
-    return AsmMirror(name, section, options, emulator=emulator)
-
-
 class AsmMirror(AdaptiveSecondary):
     """An adaptive secondary behind ESCAPE's own link, or behind another by another codec.
 
@@ -112,27 +154,48 @@ class AsmMirror(AdaptiveSecondary):
 
     Parameters
     ----------
+    serial
+        Serial number; a mirror with another one is refused.
+    name
+        Name in messages.
+    layout, pitch_m, stroke_m, limits
+        As in :class:`ExpectedMirror`; by default as the mirror reports.
     make_codec
         Makes the codec of a connection; the observatory's own goes here.
     emulator
         Started before and stopped after, instead of the configured address.
+    **options
+        Fields of :class:`~escape_drivers.asm.options.AsmOptions`, such as ``host``.
+
+    Raises
+    ------
+    ConfigError
+        The serial number is missing or an option is wrong.
     """
 
     def __init__(
         self,
-        name: str,
-        section: MirrorConfig,
-        options: AsmOptions,
+        serial: str,
         *,
+        name: str = "asm",
+        layout: str = "",
+        pitch_m: float = 1.0,
+        stroke_m: float | None = None,
+        limits: MirrorLimits | None = None,
         make_codec: Callable[[], m.Codec] = AsmCodec,
         emulator: Emulator | None = None,
+        **options: Any,
     ) -> None:
-        super().__init__(name, section.limits.to_limits(), lift=options.lift)
-        self._section, self._options, self._make_codec = section, options, make_codec
-        self._emulator = emulator
+        self._options = parse_options(AsmOptions, name, options)
+        super().__init__(name, limits or CAUTIOUS_LIMITS, lift=self._options.lift)
+        self._expected = ExpectedMirror(require_serial("serial", serial), layout, pitch_m, stroke_m, limits)
+        self._make_codec, self._emulator = make_codec, emulator
+        if emulator is None and self._options.host == EMULATOR:
+            self._emulator = emulator_factory("asm")(EmulatorRequest(port=0))
         self._link = self._make_link(m.Role.CONTROL)
-        self._info = section.info("adaptive secondary over TCP", simulated=False)
-        self._metres = np.empty(section.n_act)
+        model = "adaptive secondary over TCP"
+        self._info = self._expected.info(model, self._expected.serial, simulated=False) if layout else None
+        self._metres, self._stroke_m = np.empty(0), math.nan
         self._heartbeat: BackgroundThread | None = None
         self._ack: m.Ack | None = None
         self._last_state, self._fault_text = ShellState.OFF, ""
@@ -141,10 +204,22 @@ class AsmMirror(AdaptiveSecondary):
         self._last_warning = ""
         self._consecutive_skips = self._skipped = 0
 
+    @classmethod
+    def from_section(cls, section: MirrorConfig, context: DeviceContext) -> Self:
+        """The mirror of ``[devices.dm]``; raises ``ConfigError`` as the class does."""
+        options = section_options(AsmOptions, context.name, section)
+        emulator = None
+        if options["host"] == EMULATOR:
+            request = EmulatorRequest(port=0, shared=context.shared, config=context.system)
+            emulator = emulator_factory("asm")(request)
+        return cls(**mirror_settings(context.name, section), emulator=emulator, **options)
+
     # ------------------------------------------------------------------ identity
     @property
     def info(self) -> DMInfo:
-        """Identity and geometry."""
+        """Identity and geometry; ``NotOpen`` before a connection if no layout was given."""
+        if self._info is None:
+            raise NotOpen(self.name, "its number of actuators is known once it is open; call open() first")
         return self._info
 
     def parameter(self, key: str) -> float:
@@ -177,19 +252,28 @@ class AsmMirror(AdaptiveSecondary):
 
     def _apply_welcome(self, welcome: m.Welcome) -> None:
         """Adopt identity and state of the mirror at the beginning of a connection."""
-        disabled = require_compatible(self.name, self._section, welcome)
-        self._update_info(welcome)
+        expected = self._update_info(welcome)
+        assert expected.limits is not None
+        assert expected.stroke_m is not None
+        self.limits, self._stroke_m = expected.limits, expected.stroke_m
+        if self._metres.size != n_actuators(expected.layout):
+            self._metres = np.empty(n_actuators(expected.layout))
+        disabled = require_compatible(self.name, self.limits, self._stroke_m, welcome)
         if disabled:
             self._link.request(m.SetDisabled(disabled, "devices.dm.limits.disabled"), m.Done)
         self._last_state, self._consecutive_skips = welcome.state, 0
         is_floating = welcome.state in (ShellState.SET, ShellState.RUNNING)
         self._initial_shape = (
-            welcome.last_command_m.astype(np.float64) / self._section.stroke_m if is_floating else None
+            welcome.last_command_m.astype(np.float64) / self._stroke_m if is_floating else None
         )
 
-    def _update_info(self, welcome: m.Welcome) -> None:
+    def _update_info(self, welcome: Welcome) -> ExpectedMirror:
+        """Require the expected mirror; what was left open is as it reports."""
+        expected = self._expected.completed(self.name, welcome)
+        require_identity(self.name, expected, welcome)
         model = f"adaptive secondary over TCP, protocol {welcome.version}{', emulated' * welcome.simulated}"
-        self._info = self._section.info(model, simulated=welcome.simulated, serial=welcome.serial)
+        self._info = expected.info(model, welcome.serial, simulated=welcome.simulated)
+        return expected
 
     def _close(self) -> None:
         if self._heartbeat is not None:
@@ -282,7 +366,7 @@ class AsmMirror(AdaptiveSecondary):
         with self._lock:
             ack = self._link.request(m.Heartbeat(), m.Ack)
             self._record_ack(ack)
-        return ack.positions.astype(np.float64) / self._section.stroke_m
+        return ack.positions.astype(np.float64) / self._stroke_m
 
     def _health(self) -> ShellHealth:
         with self._lock:
@@ -293,7 +377,6 @@ class AsmMirror(AdaptiveSecondary):
         link.address = self._start_address()
         try:
             welcome = link.connect()
-            require_identity(self.name, self._section, welcome)
             self._update_info(welcome)
             return _to_shell_health(link.request(m.GetHealth(), m.HealthReport))
         finally:
@@ -326,7 +409,7 @@ class AsmMirror(AdaptiveSecondary):
         self._fault_text = ""
 
     def _send_to_shell(self, command: NDArray[np.float64]) -> NDArray[np.float64] | None:
-        np.multiply(command, self._section.stroke_m, out=self._metres)
+        np.multiply(command, self._stroke_m, out=self._metres)
         try:
             ack = self._link.command(self._metres)
         except MirrorRefusal as refusal:
@@ -369,3 +452,7 @@ def _to_shell_health(health: m.HealthReport) -> ShellHealth:
         health.time_ns, health.state, health.gap_m, health.current_a, health.temperature_c, health.skipped,
         health.fault, health.contaminated, health.owner,
     )  # fmt: skip
+
+
+#: Name of the entry point in version 0.1.0, which an environment installed then still has.
+make_asm = AsmMirror

@@ -7,18 +7,18 @@ import logging
 import math
 import threading
 import time
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Generic, Protocol, TypeVar
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields
+from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from escape_drivers.common.camera_limits import TOLERANCE, CameraLimits
-from escape_hw.api.camera import Camera, CameraInfo, CameraSettings, Frame
+from escape_drivers.common.options import parse_options, require_serial
+from escape_hw.api.camera import Camera, CameraInfo, CameraSettings, Frame, Region
+from escape_hw.config.section import Section
 from escape_hw.errors import DeviceError, DeviceLost, FrameTimeout, NotOpen, SettingRejected
-
-if TYPE_CHECKING:
-    from escape_hw.config.devices import CameraConfig
 
 
 class FrameCounter:
@@ -78,19 +78,88 @@ class CameraConnection(Protocol):
 
 
 C = TypeVar("C", bound=CameraConnection)
+OptionsT = TypeVar("OptionsT", bound=Section)
+#: Size of a sensor that the camera itself will tell.
+UNKNOWN_SENSOR = (0, 0)
+
+
+@dataclass(frozen=True, slots=True)
+class CameraRequest:
+    """What a camera is to be set to when it opens; defaults for one that is opened without a system file.
+
+    Parameters
+    ----------
+    serial
+        Serial number.
+    sensor_px
+        Width and height of the sensor as read out, pixels; ``(0, 0)``: as the camera reports.
+    region
+        x, y, width, height, pixels; ``None``: the whole sensor.
+    bit_depth
+        Bits per pixel.
+    exposure_s, frame_rate_hz, gain_db
+        See :class:`~escape_hw.api.camera.CameraSettings`.
+
+    Raises
+    ------
+    ConfigError
+        The serial number is missing.
+    """
+
+    serial: str
+    sensor_px: tuple[int, int] = UNKNOWN_SENSOR
+    region: tuple[int, int, int, int] | None = None
+    bit_depth: int = 10
+    exposure_s: float = 1e-3
+    frame_rate_hz: float = 10.0
+    gain_db: float = 0.0
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "serial", require_serial("serial", self.serial))
+
+    def settings(self, sensor_px: tuple[int, int]) -> CameraSettings:
+        """The settings for a sensor of this width and height."""
+        region = Region(0, 0, *sensor_px) if self.region is None else Region(*self.region)
+        return CameraSettings(region, self.exposure_s, self.frame_rate_hz, self.gain_db)
+
+
+def split_settings(
+    name: str, serial: str, settings: Mapping[str, Any], options: type[OptionsT]
+) -> tuple[CameraRequest, OptionsT]:
+    """Keywords of a camera's class as its request and the options of its driver.
+
+    Raises
+    ------
+    ConfigError
+        An option is unknown or wrong, or the serial number is missing.
+    """
+    keys = {field.name for field in fields(CameraRequest)} - {"serial"}
+    request = CameraRequest(serial, **{key: value for key, value in settings.items() if key in keys})
+    rest = {key: value for key, value in settings.items() if key not in keys}
+    return request, parse_options(options, name, rest)
 
 
 class BlockingCamera(Camera, Generic[C]):
     """A camera read through a blocking call, which is made in short slices.
 
     Drivers fill in ``_start_acquisition``, ``_stop_acquisition`` and ``_read_frame`` in place of ``_start``,
-    ``_stop`` and ``_next_frame``; they exclude each other. ``_open`` sets ``_connection``. ``kind`` names the
-    camera until it reports its model; ``counter`` has the first and last number of its frame counter.
+    ``_stop`` and ``_next_frame``; they exclude each other. ``_open`` sets ``_connection``.
+
+    Parameters
+    ----------
+    request
+        What the camera is to be set to when it opens.
+    kind
+        Name of the camera until it reports its model.
+    counter
+        First and last number of its frame counter.
     """
 
-    def __init__(self, name: str, section: CameraConfig, kind: str, counter: tuple[int, int]) -> None:
+    def __init__(self, name: str, request: CameraRequest, kind: str, counter: tuple[int, int]) -> None:
         super().__init__(name)
-        self._section, self._settings = section, section.settings()
+        self._request, self._kind = request, kind
+        self._sensor_px = request.sensor_px
+        self._settings = request.settings(self._sensor_px)
         self._info = self._build_info(kind, stand_in=False)
         self._full_scale = np.uint16(self._info.full_scale)
         self._saturation_mask = np.empty((0, 0), np.bool_)
@@ -109,7 +178,7 @@ class BlockingCamera(Camera, Generic[C]):
 
     @property
     def settings(self) -> CameraSettings:
-        """The settings in force, as read back from the camera."""
+        """The settings in force, as read back from the camera; before ``open`` those requested."""
         return self._settings
 
     @abc.abstractmethod
@@ -143,15 +212,15 @@ class BlockingCamera(Camera, Generic[C]):
         return self._connection
 
     def _build_info(self, model: str, stand_in: bool) -> CameraInfo:
-        section = self._section
+        request = self._request
         named = f"{model} (stand-in)" if stand_in else model
-        sensor = section.sensor_px[::-1]
-        return CameraInfo(named, section.serial, sensor, section.bit_depth, simulated=stand_in)
+        return CameraInfo(named, request.serial, self._sensor_px[::-1], request.bit_depth, simulated=stand_in)
 
-    def _require_sensor(self, found: tuple[int, int], alternative: str) -> None:
-        """Refuse a camera whose sensor size differs from the configured one (width, height)."""
-        stated = self._section.sensor_px
-        if found != stated:
+    def _adopt_sensor(self, found: tuple[int, int], alternative: str) -> None:
+        """Adopt the sensor size (width, height) that the camera reports; refuse one other than requested."""
+        stated = self._request.sensor_px
+        self._sensor_px = found
+        if stated != UNKNOWN_SENSOR and found != stated:
             raise DeviceError(
                 self.name,
                 f"is read out as {found[0]} x {found[1]} pixels, but sensor_px is {stated[0]} x "

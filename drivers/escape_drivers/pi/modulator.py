@@ -7,12 +7,13 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
 
+from escape_drivers.common.options import parse_options
 from escape_drivers.pi.circle import AxisResponse, CircleGenerator
 from escape_drivers.pi.controller import E727
 from escape_drivers.pi.gcs import MalformedReply
@@ -20,12 +21,12 @@ from escape_drivers.pi.link import GcsLink
 from escape_drivers.pi.transports import Transport, make_transport
 from escape_drivers.pi.travel import AxisTravel, read_travel
 from escape_hw.api.modulator import Modulation, ModulatorInfo, ModulatorStatus, TipTiltModulator
-from escape_hw.errors import ConfigError, DeviceError, DeviceLost
+from escape_hw.config.devices import StageConfig, WireConfig
+from escape_hw.config.registry import DeviceContext
+from escape_hw.errors import DeviceError, DeviceLost
 
 if TYPE_CHECKING:
-    from escape_hw.config.devices import ModulatorConfig, StageConfig
-    from escape_hw.config.system import SystemConfig
-
+    from escape_hw.config.devices import ModulatorConfig
 
 log = logging.getLogger(__name__)
 
@@ -81,19 +82,13 @@ def _auto_zero(name: str, controller: E727, stage: StageConfig, sleep: Callable[
             sleep(_POLL_S)
 
 
+#: Largest tilt of a stage that is opened without a system file, radians of mirror.
+CAUTIOUS_TILT_RAD = 1e-3
 #: State of a stage after the link is lost.
 _UNREACHABLE_NOTE = (
     "the stage continues its motion; opening it again stops and centres it, switching off its power "
     "releases it"
 )
-
-
-def make_modulator(name: str, config: SystemConfig, shared: dict[str, object]) -> PiModulator:
-    """Entry point ``pi-e727``; raises ``ConfigError`` if the system has no modulator."""
-    section = config.devices.modulator
-    if section is None:
-        raise ConfigError(f"system {config.system.name!r} has no [devices.modulator] section")
-    return PiModulator(name, section, lambda: make_transport(section, config, shared))
 
 
 class _Connection(NamedTuple):
@@ -114,21 +109,66 @@ class PiModulator(TipTiltModulator):
 
     When the link is lost the stage continues its motion and cannot be reached: every call raises this at
     once, and opening anew stops and centres it.
+
+    Parameters
+    ----------
+    serial
+        Serial number of the controller; one with another number is refused. Empty: any.
+    name
+        Name in messages.
+    max_tilt_rad
+        Largest tilt of the mirror from its centre, radians; the travel that the stage reports limits it too.
+    stage
+        Axes and correction of the circle: a :class:`~escape_hw.config.devices.StageConfig` or its keys.
+    connect
+        Makes the transport; absent: by ``wire``.
+    sleep
+        Waits for so many seconds.
+    **wire
+        Keys of :class:`~escape_hw.config.devices.WireConfig`, such as ``host``.
+
+    Raises
+    ------
+    ConfigError
+        A setting is unknown or wrong.
     """
 
     def __init__(
         self,
-        name: str,
-        section: ModulatorConfig,
-        connect: Callable[[], Transport],
+        serial: str = "",
+        *,
+        name: str = "modulator",
+        max_tilt_rad: float = CAUTIOUS_TILT_RAD,
+        stage: StageConfig | Mapping[str, Any] | None = None,
+        connect: Callable[[], Transport] | None = None,
         sleep: Callable[[float], None] = time.sleep,
+        **wire: Any,
     ) -> None:
         super().__init__(name)
-        self._section, self._connect, self._sleep = section, connect, sleep
+        self._serial, self._max_tilt_rad, self._sleep = serial.strip(), max_tilt_rad, sleep
+        self._stage = (
+            stage
+            if isinstance(stage, StageConfig)
+            else parse_options(StageConfig, f"{name}.stage", stage or {})
+        )
+        self._wire = wire_ = parse_options(WireConfig, name, wire)
+        self._connect = connect or (lambda: make_transport(wire_, self._serial, {}, DeviceContext(name)))
         self._connection: _Connection | None = None
         self._modulation: Modulation | None = None
         #: Survives closing: the mirror on the stage stays the same.
         self._responses: dict[int, AxisResponse] = {}
+
+    @classmethod
+    def from_section(cls, section: ModulatorConfig, context: DeviceContext) -> Self:
+        """The modulator of ``[devices.modulator]``."""
+        return cls(
+            section.serial,
+            name=context.name,
+            max_tilt_rad=section.max_tilt_rad,
+            stage=section.stage,
+            connect=lambda: make_transport(section.wire, section.serial, section.options, context),
+            **section.wire.model_dump(),
+        )
 
     @property
     def info(self) -> ModulatorInfo:
@@ -155,9 +195,7 @@ class PiModulator(TipTiltModulator):
     def _open(self) -> None:
         with self._open_connection() as connection:
             try:
-                start_up(
-                    self.name, connection.controller, self._section.stage, connection.travel, self._sleep
-                )
+                start_up(self.name, connection.controller, self._stage, connection.travel, self._sleep)
             except BaseException as failure:
                 self._clean_up(lambda: self._abort_start_up(connection.controller), failure)
                 raise
@@ -166,17 +204,17 @@ class PiModulator(TipTiltModulator):
     @contextmanager
     def _open_connection(self) -> Iterator[_Connection]:
         """Connect and learn what is there; moves nothing. Hangs up again when that, or the body, fails."""
-        link = GcsLink(self.name, self._connect(), self._section.wire.timeout_s)
+        link = GcsLink(self.name, self._connect(), self._wire.timeout_s)
         try:
             link.open()
-            controller = E727(link, self._section.stage.axes)
+            controller = E727(link, self._stage.axes)
             with self._translate_errors():
-                travel = read_travel(self.name, controller, self._section)
+                travel = read_travel(self.name, controller, self._serial, self._stage)
                 model = f"PI {controller.model} with {controller.stage_names()[0]}"
                 circle_generator = CircleGenerator(
-                    self.name, controller, self._section.stage, travel, self._responses, self._sleep
+                    self.name, controller, self._stage, travel, self._responses, self._sleep
                 )
-                reach = min(travel.reach_rad, self._section.max_tilt_rad)
+                reach = min(travel.reach_rad, self._max_tilt_rad)
                 info = ModulatorInfo(model, controller.serial, reach, "emulated" in link.identity)
                 yield _Connection(controller, travel, circle_generator, info)
         except BaseException:
@@ -230,7 +268,7 @@ class PiModulator(TipTiltModulator):
             with self._translate_errors():
                 connection.circle_generator.stop()
                 connection.controller.move_and_wait(
-                    connection.travel.centre, self._section.stage.settle_s, self._sleep
+                    connection.travel.centre, self._stage.settle_s, self._sleep
                 )
         except DeviceLost as lost:
             lost.add_note(_UNREACHABLE_NOTE)
@@ -266,7 +304,7 @@ class PiModulator(TipTiltModulator):
         return ModulatorStatus(connection.info, modulation, (float(tilt[0]), float(tilt[1])), details)
 
     def _release(self) -> bool:
-        if self._section.wire.kind == "emulator":
+        if self._wire.kind == "emulator":
             # It ends with the connection.
             return False
         connection, self._connection, self._modulation = self._require_connection(), None, None
@@ -289,3 +327,7 @@ class PiModulator(TipTiltModulator):
             raise DeviceError(
                 self.name, f"sent an unexpected reply: {error}; see the bench checklist"
             ) from error
+
+
+#: Name of the entry point in version 0.1.0, which an environment installed then still has.
+make_modulator = PiModulator

@@ -6,6 +6,7 @@ import contextlib
 import logging
 import os
 import socket
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Protocol
 
 from escape_hw.errors import ConfigError
@@ -14,8 +15,8 @@ if TYPE_CHECKING:
     from serial import Serial
 
     from escape_hw.api.emulator import Emulator
-    from escape_hw.config.devices import ModulatorConfig
-    from escape_hw.config.system import SystemConfig
+    from escape_hw.config.devices import WireConfig
+    from escape_hw.config.registry import DeviceContext
 
 
 log = logging.getLogger(__name__)
@@ -327,36 +328,39 @@ class UsbTransport:
 ADDRESS_VARIABLE = "ESCAPE_E727"
 
 
-def make_transport(section: ModulatorConfig, config: SystemConfig, shared: dict[str, object]) -> Transport:
+def make_transport(
+    wire: WireConfig, serial: str, options: Mapping[str, object], context: DeviceContext
+) -> Transport:
     """The wire that ``devices.modulator.wire`` names, or :data:`ADDRESS_VARIABLE`; not open.
+
+    ``options`` are those of an emulator.
 
     Raises
     ------
     ConfigError
         An emulator is requested and none is installed, or the environment has no address.
     """
-    wire = section.wire
     if address := os.environ.get(ADDRESS_VARIABLE):
         host, _, port = address.rpartition(":")
         if not host or not port.isdigit():
             raise ConfigError(f"{ADDRESS_VARIABLE}={address}: write HOST:PORT, or unset it")
         return TcpTransport(host, int(port), wire.connect_s, wire.timeout_s)
-    if section.options and wire.kind != "emulator":
+    if options and wire.kind != "emulator":
         raise ConfigError(
-            f"devices.modulator.options: {', '.join(section.options)}: read with wire.kind = "
-            "'emulator' only; remove"
+            f"devices.modulator.options: {', '.join(options)}: read with wire.kind = 'emulator' only; remove"
         )
     if wire.kind == "tcp":
         return TcpTransport(wire.host, wire.port, wire.connect_s, wire.timeout_s)
     if wire.kind == "serial":
         return SerialTransport(wire.serial_port, wire.baud, wire.timeout_s)
     if wire.kind == "usb":
-        return UsbTransport(wire.usb_vendor, wire.usb_product, section.serial, wire.timeout_s)
+        return UsbTransport(wire.usb_vendor, wire.usb_product, serial, wire.timeout_s)
     from escape_hw.api.emulator import EmulatorRequest
     from escape_hw.config.registry import emulator_factory
 
-    options = {"serial": section.serial, **{key: str(value) for key, value in section.options.items()}}
-    request = EmulatorRequest("127.0.0.1", 0, False, options, shared, config)
+    words = {"serial": serial, **{key: str(value) for key, value in options.items()}}
+    shared = None if context.system is None else context.shared
+    request = EmulatorRequest("127.0.0.1", 0, False, words, shared, context.system)
     return EmulatedTransport(emulator_factory("e727")(request), wire.connect_s, wire.timeout_s)
 
 

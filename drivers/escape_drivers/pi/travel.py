@@ -12,7 +12,7 @@ from escape_drivers.pi.controller import E727
 from escape_hw.errors import DeviceError
 
 if TYPE_CHECKING:
-    from escape_hw.config.devices import ModulatorConfig
+    from escape_hw.config.devices import StageConfig
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,7 +56,7 @@ class AxisTravel:
         return np.asarray((positions - self.centre) * self.unit_rad * self.gain)
 
 
-def read_travel(name: str, controller: E727, section: ModulatorConfig) -> AxisTravel:
+def read_travel(name: str, controller: E727, serial: str, stage: StageConfig) -> AxisTravel:
     """Check the controller's identity and read the limits of its axes; moves nothing.
 
     Raises
@@ -64,24 +64,24 @@ def read_travel(name: str, controller: E727, section: ModulatorConfig) -> AxisTr
     DeviceError
         Another controller, axes that are not there or carry no stage, or limits that are none.
     """
-    want, found = section.serial, controller.serial
+    want, found = serial, controller.serial
     if want and want != found:
         raise DeviceError(
             name,
             f"found the controller with serial number {found!r}, not {want!r}; see devices.modulator.serial",
         )
-    axes = section.stage.axes
+    axes = stage.axes
     present = controller.axis_names()
     for axis in axes:
         if axis not in present:
             text = f"has no axis {axis!r}, only {', '.join(present)}"
             raise DeviceError(name, f"{text}; see devices.modulator.stage.axes")
-    for axis, stage in zip(axes, controller.stage_names(), strict=True):
-        if "NOSTAGE" in stage.upper():
+    for axis, carried in zip(axes, controller.stage_names(), strict=True):
+        if "NOSTAGE" in carried.upper():
             raise DeviceError(name, f"axis {axis} carries no stage; see devices.modulator.stage.axes")
     lower, upper = controller.limits()
     if not all(low < high for low, high in zip(lower, upper, strict=True)):
         text = f"reports limits {lower} to {upper}"
         raise DeviceError(name, f"{text}; is the platform's cable plugged in? See TMN? and TMX?")
     unit_rad, servo_s = controller.unit_rad(), controller.servo_period_s()
-    return AxisTravel(np.array(lower), np.array(upper), unit_rad, servo_s, np.array(section.stage.axis_gain))
+    return AxisTravel(np.array(lower), np.array(upper), unit_rad, servo_s, np.array(stage.axis_gain))

@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+import abc
 import time
 from dataclasses import replace
 from itertools import pairwise
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from escape_drivers.common.camera import BlockingCamera
-from escape_drivers.common.options import camera_section, parse_options
-from escape_drivers.streams.source import Opener, open_milk, open_pyrtc, open_stream, with_stream_serial
+from escape_drivers.common.camera import BlockingCamera, split_settings
+from escape_drivers.common.options import camera_settings, section_options
+from escape_drivers.streams.source import (
+    open_milk,
+    open_pyrtc,
+    open_stream,
+    stream_serial,
+    with_stream_serial,
+)
 from escape_hw.api.camera import CameraInfo, CameraSettings, Frame
 from escape_hw.config.section import Section
 from escape_hw.errors import DeviceError, DeviceLost
@@ -20,7 +27,7 @@ from escape_hw.io.interchange.stream import Publication, Stream, StreamReadError
 
 if TYPE_CHECKING:
     from escape_hw.config.devices import CameraConfig
-    from escape_hw.config.system import SystemConfig
+    from escape_hw.config.registry import DeviceContext
 
 #: Frames and seconds, whichever comes first, in which the rate is measured on opening.
 _RATE_FRAMES, _RATE_TIMEOUT_S = 40, 1.0
@@ -47,51 +54,66 @@ class StreamCameraOptions(Section):
     simulated: bool = False
 
 
-def make_pyrtc_camera(name: str, config: SystemConfig, shared: dict[str, object]) -> StreamCamera:
-    """Entry point ``pyrtc-camera``.."""
-    return _build(name, config, open_pyrtc, "pyRTC stream")
-
-
-def make_milk_camera(name: str, config: SystemConfig, shared: dict[str, object]) -> StreamCamera:
-    """Entry point ``milk-camera``.."""
-    return _build(name, config, open_milk, "milk image")
-
-
-def _build(name: str, config: SystemConfig, opener: Opener, kind: str) -> StreamCamera:
-    """Raises ``ConfigError`` when the camera or its stream is missing, or an option is wrong."""
-    section = camera_section(name, config)
-    options = parse_options(StreamCameraOptions, name, section)
-    return StreamCamera(name, with_stream_serial(name, section, options.stream), options, opener, kind)
-
-
 class StreamCamera(BlockingCamera[Stream]):
     """A camera whose frames another program acquires and publishes.
 
     Its numbers are those of the writes, so a write that was overwritten before it was read is a lost frame.
     Exposure and gain are reported as configured, because the stream has no metadata; the rate is measured on
     opening, while frames come. A region is cut out of the stream.
+
+    Parameters
+    ----------
+    stream
+        Name of the stream.
+    serial
+        Serial number in products; empty: the stream's name.
+    name
+        Name in messages.
+    **settings
+        Fields of :class:`~escape_drivers.common.camera.CameraRequest` and of :class:`StreamCameraOptions`.
+
+    Raises
+    ------
+    ConfigError
+        No stream is named or an option is wrong.
     """
 
-    def __init__(
-        self, name: str, section: CameraConfig, options: StreamCameraOptions, opener: Opener, kind: str
-    ) -> None:
-        super().__init__(name, section, kind, _COUNTER_RANGE)
-        self._options, self._opener, self._kind = options, opener, kind
-        self._info = self._make_info(kind)
+    #: What the stream is called in ``info``.
+    KIND: ClassVar[str]
+
+    def __init__(self, stream: str, *, serial: str = "", name: str = "camera", **settings: Any) -> None:
+        serial = stream_serial("stream", serial, stream)
+        request, options = split_settings(name, serial, {**settings, "stream": stream}, StreamCameraOptions)
+        super().__init__(name, request, self.KIND, _COUNTER_RANGE)
+        self._options = options
+        self._info = self._make_info(self.KIND)
         self._last_count, self._written_ns = 0, 0
+
+    @classmethod
+    def from_section(cls, section: CameraConfig, context: DeviceContext) -> Self:
+        """The camera of a device section; raises ``ConfigError`` as the class does."""
+        options = section_options(StreamCameraOptions, context.name, section)
+        section = with_stream_serial(context.name, section, options)
+        return cls(**camera_settings(context.name, section), **options)
 
     def _make_info(self, kind: str) -> CameraInfo:
         return replace(self._build_info(kind, stand_in=False), simulated=self._options.simulated)
 
+    @staticmethod
+    @abc.abstractmethod
+    def _open_named(name: str, write: bool) -> Stream:
+        """Open a stream by its name, for reading or for writing."""
+
     def _open(self) -> None:
-        stream = self._connection = open_stream(self.name, self._opener, self._options.stream, write=False)
+        opener = self._open_named
+        stream = self._connection = open_stream(self.name, opener, self._options.stream, write=False)
         if len(stream.shape) != 2:
             raise DeviceError(
                 self.name, f"stream '{stream.name}' has shape {stream.shape}; a camera's frames have two axes"
             )
-        self._require_sensor(stream.shape[::-1], "to the size of the stream")
-        self._info = self._make_info(f"{self._kind} {stream.name}")
-        now = self._section.settings()
+        self._adopt_sensor((stream.shape[1], stream.shape[0]), "to the size of the stream")
+        self._info = self._make_info(f"{self.KIND} {stream.name}")
+        now = self._request.settings(self._sensor_px)
         rate = self._measure_rate(stream) or now.frame_rate_hz
         self._settings = replace(now, frame_rate_hz=rate, exposure_s=min(now.exposure_s, 1 / rate))
 
@@ -154,3 +176,27 @@ class StreamCamera(BlockingCamera[Stream]):
         steps = [(b[1] - a[1]) / (b[0] - a[0]) for a, b in pairwise(times)]
         median_period_ns = float(np.median(steps))
         return 1e9 / median_period_ns if median_period_ns > 0 else None
+
+
+class PyrtcCamera(StreamCamera):
+    """A camera of pyRTC."""
+
+    KIND = "pyRTC stream"
+
+    @staticmethod
+    def _open_named(name: str, write: bool) -> Stream:
+        return open_pyrtc(name, write)
+
+
+class MilkCamera(StreamCamera):
+    """A camera of milk or CACAO."""
+
+    KIND = "milk image"
+
+    @staticmethod
+    def _open_named(name: str, write: bool) -> Stream:
+        return open_milk(name, write)
+
+
+#: Names of the entry points in version 0.1.0, which an environment installed then still has.
+make_pyrtc_camera, make_milk_camera = PyrtcCamera, MilkCamera

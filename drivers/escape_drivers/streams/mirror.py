@@ -2,22 +2,33 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import abc
+import math
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from escape_drivers.common.options import parse_options
-from escape_drivers.streams.source import Opener, open_milk, open_pyrtc, open_stream, with_stream_serial
+from escape_drivers.common.options import layout_of, mirror_settings, parse_options, section_options
+from escape_drivers.streams.source import (
+    open_milk,
+    open_pyrtc,
+    open_stream,
+    stream_serial,
+    with_stream_serial,
+)
 from escape_hw.api.mirror import DeformableMirror, DMInfo
+from escape_hw.config import actuator_layouts
+from escape_hw.config.devices import mirror_info
 from escape_hw.config.section import Section
-from escape_hw.errors import DeviceError
+from escape_hw.errors import DeviceError, NotOpen
 from escape_hw.io.interchange.stream import Stream
+from escape_hw.safety.limits import CAUTIOUS_LIMITS, MirrorLimits
 
 if TYPE_CHECKING:
     from escape_hw.config.devices import MirrorConfig
-    from escape_hw.config.system import SystemConfig
+    from escape_hw.config.registry import DeviceContext
 
 
 class StreamMirrorOptions(Section):
@@ -38,61 +49,100 @@ class StreamMirrorOptions(Section):
     simulated: bool = False
 
 
-def make_pyrtc_mirror(name: str, config: SystemConfig, shared: dict[str, object]) -> StreamMirror:
-    """Entry point ``pyrtc-mirror``.."""
-    return _build(name, config, open_pyrtc, "pyRTC stream")
-
-
-def make_milk_mirror(name: str, config: SystemConfig, shared: dict[str, object]) -> StreamMirror:
-    """Entry point ``milk-mirror``.."""
-    return _build(name, config, open_milk, "milk image")
-
-
-def _build(name: str, config: SystemConfig, opener: Opener, kind: str) -> StreamMirror:
-    """Raises ``ConfigError`` when the stream is missing or an option is wrong."""
-    section = config.devices.dm
-    options = parse_options(StreamMirrorOptions, name, section)
-    return StreamMirror(name, with_stream_serial(name, section, options.stream), options, opener, kind)
-
-
 class StreamMirror(DeformableMirror):
     """A mirror whose commands another program reads and sends.
 
     The stream holds one number per actuator, or a map of the actuator layout.
     There is no acknowledgement: a command counts as sent when it is published.
+
+    Parameters
+    ----------
+    stream
+        Name of the stream.
+    serial
+        Serial number in products; empty: the stream's name.
+    name
+        Name in messages.
+    layout
+        Arrangement of the actuators; empty: by the number of elements of the stream.
+    pitch_m
+        Distance between actuators, metres; by default positions are in pitches.
+    stroke_m
+        Metres of surface at the actuator for a command of 1; NaN: not known.
+    limits
+        Limits of every command.
+    **options
+        Further fields of :class:`StreamMirrorOptions`.
+
+    Raises
+    ------
+    ConfigError
+        No stream is named or an option is wrong.
     """
 
+    #: What the stream is called in ``info``.
+    KIND: ClassVar[str]
+
     def __init__(
-        self, name: str, section: MirrorConfig, options: StreamMirrorOptions, opener: Opener, kind: str
+        self,
+        stream: str,
+        *,
+        serial: str = "",
+        name: str = "dm",
+        layout: str = "",
+        pitch_m: float = 1.0,
+        stroke_m: float = math.nan,
+        limits: MirrorLimits = CAUTIOUS_LIMITS,
+        **options: Any,
     ) -> None:
-        super().__init__(name, section.limits.to_limits())
-        self._section, self._options, self._opener, self._kind = section, options, opener, kind
+        super().__init__(name, limits)
+        self._serial = stream_serial("stream", serial, stream)
+        self._options = parse_options(StreamMirrorOptions, name, {**options, "stream": stream})
+        self._layout, self._pitch_m, self._stroke_m = layout, pitch_m, stroke_m
         self._stream: Stream | None = None
-        self._scaled_command, self._buffer = np.zeros(section.n_act), np.zeros(section.n_act)
+        self._scaled_command, self._buffer = np.empty(0), np.empty(0)
         # Where the buffer holds the actuators; all of it, but for a map.
         self._actuator_indices: NDArray[np.intp] | slice = slice(None)
         self._flat_buffer = self._buffer
 
+    @classmethod
+    def from_section(cls, section: MirrorConfig, context: DeviceContext) -> Self:
+        """The mirror of ``[devices.dm]``; raises ``ConfigError`` as the class does."""
+        options = section_options(StreamMirrorOptions, context.name, section)
+        section = with_stream_serial(context.name, section, options)
+        return cls(**mirror_settings(context.name, section), **options)
+
     @property
     def info(self) -> DMInfo:
-        """Identity and geometry."""
-        return self._section.info(f"{self._kind} {self._options.stream}", simulated=self._options.simulated)
+        """Identity and geometry; ``NotOpen`` before ``open`` if no layout was given."""
+        if not self._layout:
+            raise NotOpen(self.name, "its number of actuators is known once it is open; call open() first")
+        return mirror_info(
+            self._layout, self._pitch_m, self._stroke_m, f"{self.KIND} {self._options.stream}", self._serial,
+            simulated=self._options.simulated,
+        )  # fmt: skip
+
+    @staticmethod
+    @abc.abstractmethod
+    def _open_named(name: str, write: bool) -> Stream:
+        """Open a stream by its name, for reading or for writing."""
 
     def _open(self) -> None:
-        stream = self._stream = open_stream(self.name, self._opener, self._options.stream, write=True)
-        layout = self._section.actuator_map()
-        if stream.shape == (self._section.n_act,):
+        stream = self._stream = open_stream(self.name, self._open_named, self._options.stream, write=True)
+        layout = self._layout = self._layout or layout_of(self.name, math.prod(stream.shape))
+        n_act = actuator_layouts.n_actuators(layout)
+        grid = actuator_layouts.actuator_map(layout) if actuator_layouts.is_on_grid(layout) else None
+        if stream.shape == (n_act,):
             self._actuator_indices = slice(None)
-        elif layout is not None and stream.shape == layout.shape:
-            self._actuator_indices = np.flatnonzero(layout)
+        elif grid is not None and stream.shape == grid.shape:
+            self._actuator_indices = np.flatnonzero(grid)
         else:
-            wanted = f"({self._section.n_act},)" + ("" if layout is None else f" or {layout.shape}")
+            wanted = f"({n_act},)" + ("" if grid is None else f" or {grid.shape}")
             raise DeviceError(
                 self.name,
-                f"stream '{stream.name}' has shape {stream.shape}; the layout {self._section.layout!r} needs "
-                f"{wanted}",
+                f"stream '{stream.name}' has shape {stream.shape}; the layout {layout!r} needs {wanted}",
             )
-        self._buffer = np.zeros(stream.shape)
+        self._scaled_command, self._buffer = np.zeros(n_act), np.zeros(stream.shape)
         self._flat_buffer = self._buffer.reshape(-1)
 
     def _close(self) -> None:
@@ -114,3 +164,27 @@ class StreamMirror(DeformableMirror):
             raise DeviceError(
                 self.name, f"stream '{self._options.stream}' takes no command ({error})"
             ) from error
+
+
+class PyrtcMirror(StreamMirror):
+    """A mirror of pyRTC."""
+
+    KIND = "pyRTC stream"
+
+    @staticmethod
+    def _open_named(name: str, write: bool) -> Stream:
+        return open_pyrtc(name, write)
+
+
+class MilkMirror(StreamMirror):
+    """A mirror of milk or CACAO."""
+
+    KIND = "milk image"
+
+    @staticmethod
+    def _open_named(name: str, write: bool) -> Stream:
+        return open_milk(name, write)
+
+
+#: Names of the entry points in version 0.1.0, which an environment installed then still has.
+make_pyrtc_mirror, make_milk_mirror = PyrtcMirror, MilkMirror

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
@@ -49,16 +49,21 @@ def open_stream(device: str, opener: Opener, name: str, *, write: bool) -> Strea
     return stream
 
 
-def with_stream_serial(device: str, section: S, stream: str) -> S:
-    """A device section; without a serial number, the stream's name is used.
+def stream_serial(where: str, serial: str, stream: str) -> str:
+    """A serial number; without one, the stream's name is used.
 
     Raises
     ------
     ConfigError
-        No stream is named.
+        No stream is named; ``where`` is the key.
     """
     if not stream.strip():
-        raise ConfigError(
-            f"devices.{device}.options.stream: ''  names no stream that could stand for the device; enter it"
-        )
-    return section if section.serial.strip() else section.model_copy(update={"serial": f"stream {stream}"})
+        raise ConfigError(f"{where}: ''  names no stream that could stand for the device; enter it")
+    return serial.strip() or f"stream {stream}"
+
+
+def with_stream_serial(device: str, section: S, options: Mapping[str, object]) -> S:
+    """A device section with a serial number, which is the stream's name where it has none."""
+    where = f"devices.{device}.options.stream"
+    serial = stream_serial(where, section.serial, str(options.get("stream", "")))
+    return section.model_copy(update={"serial": serial})

@@ -1,4 +1,5 @@
-"""XIMEA cameras: the driver and the binding of the vendor's xiAPI.
+"""XIMEA cameras: the driver and the binding of the vendor's xiAPI."""
 
-Exports ``XimeaCamera``, ``XimeaOptions``.
-"""
+from escape_drivers.ximea.camera import XimeaCamera, XimeaOptions
+
+__all__ = ["XimeaCamera", "XimeaOptions"]

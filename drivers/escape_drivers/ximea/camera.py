@@ -5,15 +5,15 @@ from __future__ import annotations
 import ctypes
 import logging
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from escape_drivers.common.camera import BlockingCamera
+from escape_drivers.common.camera import BlockingCamera, split_settings
 from escape_drivers.common.camera_limits import CameraLimits, ParameterRange
-from escape_drivers.common.options import camera_section, parse_options, require_serial
+from escape_drivers.common.options import camera_settings, section_options
 from escape_drivers.ximea.library import NO_IMAGE, TIMEOUT, XiImage, XimeaLibrary
 from escape_hw.api.camera import CameraSettings, Frame, Region
 from escape_hw.config.section import Section
@@ -21,7 +21,7 @@ from escape_hw.errors import DeviceError
 
 if TYPE_CHECKING:
     from escape_hw.config.devices import CameraConfig
-    from escape_hw.config.system import SystemConfig
+    from escape_hw.config.registry import DeviceContext
 
 log = logging.getLogger(__name__)
 
@@ -105,29 +105,45 @@ class XimeaOptions(Section):
         return parameters_to_set
 
 
-def make_camera(name: str, config: SystemConfig, shared: dict[str, object]) -> XimeaCamera:
-    """Entry point ``ximea``; raises ``ConfigError`` if its serial number is missing or an option is wrong."""
-    section = camera_section(name, config)
-    require_serial(name, section)
-    return XimeaCamera(name, section, parse_options(XimeaOptions, name, section))
-
-
 class XimeaCamera(BlockingCamera[XimeaLibrary]):
     """A XIMEA camera.
 
     Frames are copied out of the library's ring at once, so that nothing overwrites them. Losses show as
     gaps of the camera's own counter. With a trigger the frame rate is that of the edges, and the one
     configured is only stated.
+
+    Parameters
+    ----------
+    serial
+        Serial number.
+    name
+        Name in messages.
+    **settings
+        Fields of :class:`~escape_drivers.common.camera.CameraRequest` (``region``, ``exposure_s``,
+        ``frame_rate_hz``, ``gain_db``, ``bit_depth``; the size of the sensor is read from the camera) and of
+        :class:`XimeaOptions`.
+
+    Raises
+    ------
+    ConfigError
+        The serial number is missing or an option is wrong.
     """
 
-    def __init__(self, name: str, section: CameraConfig, options: XimeaOptions) -> None:
-        super().__init__(name, section, "XIMEA camera", (0, _NO_FRAME_NUMBER))
+    def __init__(self, serial: str, *, name: str = "ximea", **settings: Any) -> None:
+        request, options = split_settings(name, serial, settings, XimeaOptions)
+        super().__init__(name, request, "XIMEA camera", (0, _NO_FRAME_NUMBER))
         self._options = options
         self._image = XiImage(size=ctypes.sizeof(XiImage))
         self._address = ctypes.c_void_p(ctypes.addressof(self._image))
         self._get_image: Callable[..., int] = _raise_not_connected
         self._frame_views: dict[int, NDArray[np.uint16]] = {}
         self._expected_shape = (0, 0)
+
+    @classmethod
+    def from_section(cls, section: CameraConfig, context: DeviceContext) -> Self:
+        """The camera of a device section; raises ``ConfigError`` as the class does."""
+        options = section_options(XimeaOptions, context.name, section)
+        return cls(**camera_settings(context.name, section), **options)
 
     @property
     def handle(self) -> ctypes.c_void_p:
@@ -144,20 +160,20 @@ class XimeaCamera(BlockingCamera[XimeaLibrary]):
 
     def _open(self) -> None:
         library = self._connection = XimeaLibrary(self.name, self._options.library)
-        library.open(self._section.serial.strip())
-        for name, value in self._options.sdk_parameters(self._section.bit_depth):
+        library.open(self._request.serial)
+        for name, value in self._options.sdk_parameters(self._request.bit_depth):
             library.set(name, value)
         _reset_offset(library)
         limits = self._limits = _read_limits(library)
         sensor = (round(limits.width.high), round(limits.height.high))
-        self._require_sensor(sensor, "or the option 'downsampling'")
+        self._adopt_sensor(sensor, "or the option 'downsampling'")
         model, serial, version = (
             library.get_text(key) for key in ("device_name", "device_sn", "api_version")
         )
         log.info("%s: %s %s, xiAPI %s", self.name, model, serial, version)
         self._info = self._build_info(f"XIMEA {model}", library.stand_in)
         self._get_image = library.c.xiGetImage
-        self._settings = self._apply_settings(self._check(self._section.settings()))
+        self._settings = self._apply_settings(self._check(self._request.settings(sensor)))
 
     def _disconnect(self) -> None:
         self._get_image = _raise_not_connected
@@ -245,6 +261,10 @@ class XimeaCamera(BlockingCamera[XimeaLibrary]):
         view: NDArray[np.uint16] = np.ndarray((height, width), np.uint16, buffer=bytes_, strides=(pitch, 2))
         self._frame_views[image.bp] = view
         return view
+
+
+#: Name of the entry point in version 0.1.0, which an environment installed then still has.
+make_camera = XimeaCamera
 
 
 def _reset_offset(library: XimeaLibrary) -> None:

@@ -11,23 +11,22 @@ import typer
 from escape_hw.cli import options
 from escape_hw.cli.command import command
 from escape_hw.cli.context import CommandContext
-from escape_hw.cli.devices.device_tools import announce_change, build_single_device
+from escape_hw.cli.devices.device_tools import DeviceCommand, SelectedDevice, select_device
 from escape_hw.errors import ConfigError
 
 if TYPE_CHECKING:
     from escape_hw.api.adaptive_secondary import AdaptiveSecondary, ShellHealth
-    from escape_hw.config.system import SystemConfig
 
 app = typer.Typer(
     help="Set, rest or query an adaptive secondary, and clear its faults.", no_args_is_help=True
 )
 
 
-@app.command("status")
+@app.command("status", cls=DeviceCommand)
 @command("asm status")
-def status(context: CommandContext, selection: options.Selection) -> None:
+def status(context: CommandContext, selection: options.DeviceSelection) -> None:
     """Show state and health; takes no control and moves nothing."""
-    _, mirror = _secondary(context, selection)
+    mirror = _secondary(context, selection).device
     context.devices_opened = True
     health = mirror.observe_health()
     info = mirror.info
@@ -37,29 +36,30 @@ def status(context: CommandContext, selection: options.Selection) -> None:
     )
 
 
-@app.command("set")
+@app.command("set", cls=DeviceCommand)
 @command("asm set")
-def set_(context: CommandContext, selection: options.Selection) -> None:
+def set_(context: CommandContext, selection: options.DeviceSelection) -> None:
     """Float the shell, flat: MOVES it. It stays afloat under its own control after the command."""
     _go_to_state(context, selection, floating=True)
 
 
-@app.command("rest")
+@app.command("rest", cls=DeviceCommand)
 @command("asm rest")
-def rest(context: CommandContext, selection: options.Selection) -> None:
+def rest(context: CommandContext, selection: options.DeviceSelection) -> None:
     """Lay the shell on its reference body: MOVES it."""
     _go_to_state(context, selection, floating=False)
 
 
-@app.command("clear")
+@app.command("clear", cls=DeviceCommand)
 @command("asm clear")
 def clear(
     context: CommandContext,
-    selection: options.Selection,
+    selection: options.DeviceSelection,
     yes: Annotated[bool, typer.Option("--yes", help="The cause is fixed; do not ask.")] = False,
 ) -> None:
     """Clear a latched fault after its cause is fixed; the shell is at rest afterwards."""
-    config, mirror = _secondary(context, selection)
+    chosen = _secondary(context, selection)
+    mirror = chosen.device
     context.devices_opened = True
     previous = after = mirror.observe_health()
     if previous.state == "fault" and not yes:
@@ -67,7 +67,7 @@ def clear(
         if context.json or not sys.stdin.isatty() or not typer.confirm("Is its cause fixed?", err=True):
             raise ConfigError("the fault was not cleared; fix its cause, then confirm with --yes")
     if previous.state == "fault":
-        announce_change(context, config, "dm", f"clear the fault '{previous.fault}'")
+        chosen.announce_change(context, f"clear the fault '{previous.fault}'")
         with context.open_protected(mirror):
             mirror.recover()
             after = mirror.health
@@ -80,25 +80,26 @@ def clear(
 
 def _secondary(
     context: CommandContext, selection: options.SystemSelection
-) -> tuple[SystemConfig, AdaptiveSecondary]:
-    """The system's adaptive secondary, not open."""
+) -> SelectedDevice[AdaptiveSecondary]:
+    """The adaptive secondary, not open."""
     from escape_hw.api.adaptive_secondary import AdaptiveSecondary
 
-    config, mirror = build_single_device(context, selection, "dm", AdaptiveSecondary)  # type: ignore[type-abstract]
+    chosen = select_device(context, selection, "dm", AdaptiveSecondary)  # type: ignore[type-abstract]
     # A query, or clearing a fault, must not lift the shell.
-    mirror.lift = False
-    return config, mirror
+    chosen.device.lift = False
+    return chosen
 
 
 def _go_to_state(context: CommandContext, selection: options.SystemSelection, *, floating: bool) -> None:
     """Bring the mirror to a state and leave it there."""
     from escape_hw.api.adaptive_secondary import ShellState
 
-    config, mirror = _secondary(context, selection)
+    chosen = _secondary(context, selection)
+    mirror = chosen.device
     requested = ShellState.SET if floating else ShellState.RESTED
     context.devices_opened = True
     previous = mirror.observe_health().state
-    announce_change(context, config, "dm", f"from {previous} to {requested}")
+    chosen.announce_change(context, f"from {previous} to {requested}")
     mirror.leave_set = floating
     with context.open_protected(mirror):
         mirror.go_to(requested)

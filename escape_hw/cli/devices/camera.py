@@ -11,12 +11,11 @@ import typer
 from escape_hw.cli import options
 from escape_hw.cli.command import command
 from escape_hw.cli.context import CommandContext
-from escape_hw.cli.devices.device_tools import announce_change, build_single_device
+from escape_hw.cli.devices.device_tools import DeviceCommand, SelectedDevice, select_device
 from escape_hw.errors import ConfigError
 
 if TYPE_CHECKING:
     from escape_hw.api.camera import Camera, CameraInfo, CameraSettings, Frame
-    from escape_hw.config.devices import CameraConfig
     from escape_hw.config.system import SystemConfig
 
 app = typer.Typer(
@@ -27,11 +26,11 @@ Which = Annotated[
 ]
 
 
-@app.command("snap")
+@app.command("snap", cls=DeviceCommand)
 @command("camera snap", quiet=True)
 def snap(
     context: CommandContext,
-    selection: options.Selection,
+    selection: options.DeviceSelection,
     camera: Which = "wfs",
     frames: Annotated[int, typer.Option("--frames", min=1, max=100000, help="Number of frames.")] = 1,
     out: Annotated[
@@ -43,15 +42,16 @@ def snap(
 
     from escape_hw.runtime.host.device_tools import grab_frames
 
-    config, section, device = _camera(context, selection, camera)
+    chosen = _camera(context, selection, camera)
+    device = chosen.device
     if out is not None and out.exists():
         raise ConfigError(f"{out}: exists; choose another name or remove it")
     with context.open_protected(device):
-        settings, changed = _apply_configuration(context, config, camera, device)
-        frame_list = context.run(grab_frames(device, frames, section.timeout_s))
+        settings, changed = _apply_configuration(context, chosen)
+        frame_list = context.run(grab_frames(device, frames, _timeout_s(chosen)))
         info, status = device.info, device.status()
     if out is not None:
-        _save(out, frame_list, info, settings, config)
+        _save(out, frame_list, info, settings, chosen.config)
     cube = np.stack([frame.data for frame in frame_list])
     counts = {"min": int(cube.min()), "max": int(cube.max()), "mean": float(cube.mean())}
     saturated = max(frame.n_saturated for frame in frame_list)
@@ -68,21 +68,22 @@ def snap(
     )  # fmt: skip
 
 
-@app.command("stream")
+@app.command("stream", cls=DeviceCommand)
 @command("camera stream", quiet=True)
 def stream(
     context: CommandContext,
-    selection: options.Selection,
+    selection: options.DeviceSelection,
     camera: Which = "wfs",
     seconds: Annotated[float, typer.Option("--seconds", min=0.01, max=86400, help="Duration.")] = 1.0,
 ) -> None:
     """Monitor a running camera: rate, lost frames, counts. Exit code 1 when frames were lost."""
     from escape_hw.runtime.host.device_tools import monitor_camera
 
-    config, section, device = _camera(context, selection, camera)
+    chosen = _camera(context, selection, camera)
+    device = chosen.device
     with context.open_protected(device):
-        settings, changed = _apply_configuration(context, config, camera, device)
-        statistics = context.run(monitor_camera(device, seconds, section.timeout_s))
+        settings, changed = _apply_configuration(context, chosen)
+        statistics = context.run(monitor_camera(device, seconds, _timeout_s(chosen)))
         info = device.info
     context.show(
         f"{info.model} {info.serial}: {statistics.frames} frames at {statistics.rate_hz:.2f} Hz "
@@ -98,11 +99,11 @@ def stream(
     context.code = context.code or int(statistics.status.lost > 0)
 
 
-@app.command("settings")
+@app.command("settings", cls=DeviceCommand)
 @command("camera settings")
 def settings(
     context: CommandContext,
-    selection: options.Selection,
+    selection: options.DeviceSelection,
     camera: Which = "wfs",
     exposure: Annotated[float | None, typer.Option("--exposure", help="Exposure time, seconds.")] = None,
     rate: Annotated[float | None, typer.Option("--frame-rate", help="Frames per second, hertz.")] = None,
@@ -115,11 +116,13 @@ def settings(
     ] = False,
 ) -> None:
     """Check settings, then set them; shows the settings in force, as TOML to paste."""
-    config, section, device = _camera(context, selection, camera)
-    requested = _requested_settings(section.settings(), exposure, rate, gain, region)
+    chosen = _camera(context, selection, camera)
+    device = chosen.device
     if not check:
-        announce_change(context, config, camera, "exposure, frame rate, gain and region")
+        chosen.announce_change(context, "exposure, frame rate, gain and region")
     with context.open_protected(device):
+        base = device.settings if chosen.section is None else chosen.section.settings()
+        requested = _requested_settings(base, exposure, rate, gain, region)
         achievable = device.check(requested)
         now = achievable if check else device.configure(requested)
         info = device.info
@@ -132,25 +135,29 @@ def settings(
     )  # fmt: skip
 
 
-def _camera(
-    context: CommandContext, selection: options.SystemSelection, key: str
-) -> tuple[SystemConfig, CameraConfig, Camera]:
+def _camera(context: CommandContext, selection: options.SystemSelection, key: str) -> SelectedDevice[Camera]:
     from escape_hw.api.camera import Camera
 
-    config, device = build_single_device(context, selection, key, Camera)  # type: ignore[type-abstract]
-    section: CameraConfig = getattr(config.devices, key)
-    return config, section, device
+    return select_device(context, selection, key, Camera)  # type: ignore[type-abstract]
+
+
+def _timeout_s(chosen: SelectedDevice[Camera]) -> float:
+    """Longest wait for a frame, seconds; without a system several frames long."""
+    if chosen.section is not None:
+        return float(chosen.section.timeout_s)
+    return max(1.0, 5 / chosen.device.settings.frame_rate_hz)
 
 
 def _apply_configuration(
-    context: CommandContext, config: SystemConfig, key: str, device: Camera
+    context: CommandContext, chosen: SelectedDevice[Camera]
 ) -> tuple[CameraSettings, bool]:
     """Apply the configuration to the open camera; the settings in force, and whether they changed."""
-    before, requested = device.settings, getattr(config.devices, key).settings()
+    before = chosen.device.settings
+    requested = before if chosen.section is None else chosen.section.settings()
     if before == requested:
         return before, False
-    announce_change(context, config, key, "the settings of the configuration")
-    return device.configure(requested), True
+    chosen.announce_change(context, "the settings of the configuration")
+    return chosen.device.configure(requested), True
 
 
 def _requested_settings(
@@ -183,10 +190,17 @@ def _format_toml(settings: CameraSettings) -> list[str]:
 
 
 def _save(
-    out: Path, frame_list: list[Frame], info: CameraInfo, settings: CameraSettings, config: SystemConfig
+    out: Path,
+    frame_list: list[Frame],
+    info: CameraInfo,
+    settings: CameraSettings,
+    config: SystemConfig | None,
 ) -> None:
     from escape_hw.io.fits.frames import save_frames
     from escape_hw.io.provenance import Provenance
 
-    origin = Provenance(config.to_toml(), seed=config.system.seed, serials={"camera": info.serial})
-    save_frames(out, frame_list, info, settings, config.system.name, origin)
+    name, text, seed = "", "", None
+    if config is not None:
+        name, text, seed = config.system.name, config.to_toml(), config.system.seed
+    origin = Provenance(text, seed=seed, serials={"camera": info.serial})
+    save_frames(out, frame_list, info, settings, name, origin)

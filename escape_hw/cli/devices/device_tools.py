@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, TypeVar
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
+
+from typer.core import TyperCommand
 
 from escape_hw.cli.context import CommandContext
 from escape_hw.cli.options import SystemSelection
+from escape_hw.errors import ConfigError
 
 if TYPE_CHECKING:
     from escape_hw.api.device import Device
@@ -14,20 +18,80 @@ if TYPE_CHECKING:
 D = TypeVar("D", bound="Device")
 
 
-def announce_change(context: CommandContext, config: SystemConfig, key: str, what: str) -> None:
-    """Announce how a real device is about to change; nothing for a simulated one."""
-    from escape_hw.bench import resolve_mode
+class DeviceCommand(TyperCommand):
+    """A command whose first argument names a system, which ``--driver`` replaces."""
 
-    section = getattr(config.devices, key)
-    if resolve_mode(section, config) == "hardware":
-        context.notify(f"this changes hardware, devices.{key} {section.serial}: {what}")
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Parse the command line; with ``--driver`` the system is empty."""
+        before_values = args[: args.index("--")] if "--" in args else args
+        if any(word.partition("=")[0] == "--driver" for word in before_values):
+            args = ["", *args]
+        return super().parse_args(ctx, args)
 
 
-def build_single_device(
+@dataclass(frozen=True)
+class SelectedDevice(Generic[D]):
+    """One device, not open, and the system that it is part of, if it is."""
+
+    key: str
+    device: D
+    config: SystemConfig | None
+    selection: SystemSelection
+
+    @property
+    def section(self) -> Any:
+        """Its section of ``[devices]``; ``None`` without a system."""
+        return None if self.config is None else getattr(self.config.devices, self.key)
+
+    @property
+    def is_hardware(self) -> bool:
+        """Whether it is meant to be a real device."""
+        from escape_hw.bench import resolve_mode
+
+        return self.config is None or resolve_mode(self.section, self.config) == "hardware"
+
+    def announce_change(self, context: CommandContext, what: str) -> None:
+        """Announce how a real device is about to change; nothing for a simulated one."""
+        if self.is_hardware:
+            name = f"{self.selection.driver} {self.selection.serial}"
+            if self.config is not None:
+                name = f"devices.{self.key} {self.section.serial}"
+            context.notify(f"this changes hardware, {name}: {what}")
+
+
+def select_device(
     context: CommandContext, selection: SystemSelection, key: str, kind: type[D]
-) -> tuple[SystemConfig, D]:
-    """Configuration and one device of a system, not open."""
-    from escape_hw.bench import build_device
+) -> SelectedDevice[D]:
+    """One device of a system, or of a driver; not open."""
+    from escape_hw.bench import build_device, build_standalone_device
 
-    config = context.load_config(selection)
-    return config, build_device(key, config, kind)
+    if not selection.driver:
+        if selection.serial:
+            raise ConfigError(f"--serial {selection.serial}: goes with --driver; a system file has its own")
+        config = context.load_config(selection)
+        if getattr(config.devices, key) is None:
+            raise ConfigError(f"system '{config.system.name}' has no {key}, [devices.{key}]")
+        return SelectedDevice(key, build_device(key, config, kind), config, selection)
+    if selection.mode is not None or selection.seed is not None:
+        raise ConfigError("--mode and --seed: not with --driver, which opens one real device")
+    settings = _parse_settings(selection.set)
+    if selection.serial:
+        settings["serial"] = selection.serial
+    return SelectedDevice(key, build_standalone_device(selection.driver, kind, **settings), None, selection)
+
+
+def _parse_settings(changes: tuple[str, ...]) -> dict[str, Any]:
+    """Settings of a driver, from ``key=value`` and ``table.key=value``."""
+    from escape_hw.config.loader import parse_override
+
+    settings: dict[str, Any] = {}
+    for text in changes:
+        override = parse_override(text)
+        *tables, key = override.path
+        table = settings
+        for name in tables:
+            table = table.setdefault(name, {})
+            if not isinstance(table, dict):
+                raise ConfigError(f"--set  {text}: {name} has a value already, {table!r}")
+        table[key] = override.value
+    return settings

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -10,7 +11,7 @@ import typer
 from escape_hw.cli import options
 from escape_hw.cli.command import command
 from escape_hw.cli.context import CommandContext
-from escape_hw.cli.devices.device_tools import announce_change, build_single_device
+from escape_hw.cli.devices.device_tools import DeviceCommand, SelectedDevice, select_device
 from escape_hw.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -23,12 +24,13 @@ app = typer.Typer(
 Seconds = Annotated[float, typer.Option("--seconds", min=0, max=3600, help="Duration; flat afterwards.")]
 
 
-@app.command("flat")
+@app.command("flat", cls=DeviceCommand)
 @command("dm flat")
-def flat(context: CommandContext, selection: options.Selection) -> None:
+def flat(context: CommandContext, selection: options.DeviceSelection) -> None:
     """Ramp to the flat shape: MOVES the mirror."""
-    config, dm = _mirror(context, selection)
-    announce_change(context, config, "dm", "ramp to flat")
+    chosen = _mirror(context, selection)
+    dm = chosen.device
+    chosen.announce_change(context, "ramp to flat")
     _preserve_floating(dm)
     with context.open_protected(dm):
         dm.flatten()
@@ -38,23 +40,23 @@ def flat(context: CommandContext, selection: options.Selection) -> None:
 
 
 # Otherwise a negative amplitude is parsed as an option.
-@app.command("poke", context_settings={"ignore_unknown_options": True})
+@app.command("poke", cls=DeviceCommand, context_settings={"ignore_unknown_options": True})
 @command("dm poke", quiet=True)
 def poke(
     context: CommandContext,
-    selection: options.Selection,
+    selection: options.DeviceSelection,
     actuator: Annotated[int, typer.Argument(min=0, help="Number of the actuator, counted from 0.")],
     amplitude: Annotated[float, typer.Argument(help="Fraction of full stroke, such as 0.05.")],
     seconds: Seconds = 1.0,
 ) -> None:
     """Poke one actuator for a while: MOVES the mirror, flat before and after."""
-    config, dm = _mirror(context, selection)
-    _require_actuator(config, actuator, amplitude)
+    chosen = _mirror(context, selection)
+    dm = chosen.device
+    if chosen.config is not None:
+        _require_actuator(chosen.config, actuator, amplitude)
     from escape_hw.runtime.host.device_tools import hold_shape, poke_shape
 
-    announce_change(
-        context, config, "dm", f"flat, then actuator {actuator} by {amplitude:g} for {seconds:g} s"
-    )
+    chosen.announce_change(context, f"flat, then actuator {actuator} by {amplitude:g} for {seconds:g} s")
     _preserve_floating(dm)
     with context.open_protected(dm):
         dm.flatten()
@@ -65,11 +67,11 @@ def poke(
     context.report(simulated=info.simulated, changed=True, asked=asked, **asdict(motion))
 
 
-@app.command("wave")
+@app.command("wave", cls=DeviceCommand)
 @command("dm wave", quiet=True)
 def wave(
     context: CommandContext,
-    selection: options.Selection,
+    selection: options.DeviceSelection,
     amplitude: Annotated[float, typer.Option("--amplitude", min=0, max=1, help="Of full stroke.")] = 0.02,
     frequency: Annotated[float, typer.Option("--frequency", min=0.01, max=20, help="Hertz.")] = 0.5,
     waves: Annotated[float, typer.Option("--waves", min=0, max=20, help="Periods across.")] = 2.0,
@@ -78,8 +80,9 @@ def wave(
     """Run a wave over the mirror: MOVES every actuator, flat before and after."""
     from escape_hw.runtime.host.device_tools import run_wave, wave_generator
 
-    config, dm = _mirror(context, selection)
-    announce_change(context, config, "dm", f"a wave of {amplitude:g} at {frequency:g} Hz for {seconds:g} s")
+    chosen = _mirror(context, selection)
+    dm = chosen.device
+    chosen.announce_change(context, f"a wave of {amplitude:g} at {frequency:g} Hz for {seconds:g} s")
     _preserve_floating(dm)
     with context.open_protected(dm):
         dm.flatten()
@@ -92,16 +95,17 @@ def wave(
     context.report(simulated=info.simulated, changed=True, asked=asked, **asdict(motion))
 
 
-@app.command("status")
+@app.command("status", cls=DeviceCommand)
 @command("dm status")
-def status(context: CommandContext, selection: options.Selection) -> None:
+def status(context: CommandContext, selection: options.DeviceSelection) -> None:
     """Show properties and limits of the mirror.
 
     An adaptive secondary is only observed. Any other mirror is opened, and flat when it is closed.
     """
     from escape_hw.api.adaptive_secondary import AdaptiveSecondary
 
-    config, dm = _mirror(context, selection)
+    chosen = _mirror(context, selection)
+    dm = chosen.device
     rest: dict[str, Any] = {"health": None}
     if isinstance(dm, AdaptiveSecondary):
         context.devices_opened = True
@@ -109,13 +113,12 @@ def status(context: CommandContext, selection: options.Selection) -> None:
         rest["health"], changed = asdict(health), False
         context.show(f"{health.state}, gap {health.gap_m * 1e6:.1f} um {health.fault}".rstrip())
     else:
-        announce_change(context, config, "dm", "it is opened, and flattened when it is closed")
+        chosen.announce_change(context, "it is opened, and flattened when it is closed")
         with context.open_protected(dm):
             changed = True
     info, limits = dm.info, dm.limits
-    context.show(
-        f"{info.model} {info.serial}: {info.n_act} actuators, full stroke {info.stroke_m * 1e6:g} um"
-    )
+    stroke = "unknown" if math.isnan(info.stroke_m) else f"{info.stroke_m * 1e6:g} um"
+    context.show(f"{info.model} {info.serial}: {info.n_act} actuators, full stroke {stroke}")
     context.show(f"limits: {', '.join(f'{key} {value}' for key, value in asdict(limits).items())}")
     context.report(
         simulated=info.simulated, changed=changed, model=info.model, serial=info.serial, n_act=info.n_act,
@@ -123,12 +126,10 @@ def status(context: CommandContext, selection: options.Selection) -> None:
     )  # fmt: skip
 
 
-def _mirror(
-    context: CommandContext, selection: options.SystemSelection
-) -> tuple[SystemConfig, DeformableMirror]:
+def _mirror(context: CommandContext, selection: options.SystemSelection) -> SelectedDevice[DeformableMirror]:
     from escape_hw.api.mirror import DeformableMirror
 
-    return build_single_device(context, selection, "dm", DeformableMirror)  # type: ignore[type-abstract]
+    return select_device(context, selection, "dm", DeformableMirror)  # type: ignore[type-abstract]
 
 
 def _preserve_floating(dm: DeformableMirror) -> None:

@@ -11,27 +11,30 @@ import typer
 from escape_hw.cli import options
 from escape_hw.cli.command import command
 from escape_hw.cli.context import CommandContext
-from escape_hw.cli.devices.device_tools import announce_change
+from escape_hw.cli.devices.device_tools import DeviceCommand, SelectedDevice, select_device
 from escape_hw.errors import ConfigError
 
 if TYPE_CHECKING:
     from escape_hw.api.modulator import Modulation, ModulatorStatus, TipTiltModulator
     from escape_hw.config.devices import ModulatorConfig
-    from escape_hw.config.system import SystemConfig
 
 app = typer.Typer(
     help="Start, stop or query the tip-tilt modulator; simulated or real.", no_args_is_help=True
 )
 
 
-@app.command("start")
+@app.command("start", cls=DeviceCommand)
 @command("modulator start")
 def start(
     context: CommandContext,
-    selection: options.Selection,
+    selection: options.DeviceSelection,
     radius: Annotated[
         float | None,
         typer.Option("--radius", min=0, help="lambda/D on the pyramid (default: as configured)."),
+    ] = None,
+    radius_rad: Annotated[
+        float | None,
+        typer.Option("--radius-rad", min=0, help="Radians of mirror tilt, in place of --radius."),
     ] = None,
     frequency: Annotated[
         float | None, typer.Option("--frequency", help="Frequency, hertz (default: as configured).")
@@ -48,15 +51,10 @@ def start(
     The stage continues by its own clock after the command; 'escape modulator stop' stops it. A simulated
     one ends with the command.
     """
-    from escape_hw.api.modulator import Modulation
-    from escape_hw.config.sensor import PyramidSection
-
-    config, section, device = _device(context, selection)
-    radius_lambda_d = config.sensor_as(PyramidSection).modulation if radius is None else radius
-    requested = Modulation(radius_lambda_d * section.rad_per_lambda_d, frequency or section.frequency_hz)
-    announce_change(
-        context, config, "modulator", "servos on, auto-zero where needed, centre, then the circle"
-    )
+    chosen = _device(context, selection)
+    device, section = chosen.device, chosen.section
+    requested = _requested_modulation(chosen, radius, radius_rad, frequency)
+    chosen.announce_change(context, "servos on, auto-zero where needed, centre, then the circle")
     with context.open_protected(device):
         achievable = device.check(requested)
         context.notify(f"requested: {_format_modulation(requested, section)}")
@@ -68,19 +66,24 @@ def start(
         left = seconds is None and device.release()
     final_state = "modulating; stop it with: escape modulator stop" if left else "parked"
     context.show(*_format_status(status, section), f"left {final_state}")
-    asked = {"radius_lambda_d": radius_lambda_d, "frequency_hz": requested.frequency_hz}
+    asked = {"frequency_hz": requested.frequency_hz}
+    if (radius_lambda_d := _lambda_d(requested, section)) is None:
+        asked["radius_rad"] = requested.radius_rad
+    else:
+        asked["radius_lambda_d"] = radius_lambda_d
     context.report(
         **_status_fields(status, section), asked=asked, foreseen=asdict(achievable),
         left="turning" if left else "parked", changed=True,
     )  # fmt: skip
 
 
-@app.command("stop")
+@app.command("stop", cls=DeviceCommand)
 @command("modulator stop")
-def stop(context: CommandContext, selection: options.Selection) -> None:
+def stop(context: CommandContext, selection: options.DeviceSelection) -> None:
     """Stop and park: MOVES the stage to its centre, then switches its servos off."""
-    config, section, device = _device(context, selection)
-    announce_change(context, config, "modulator", "centre, servos off")
+    chosen = _device(context, selection)
+    device, section = chosen.device, chosen.section
+    chosen.announce_change(context, "centre, servos off")
     with context.open_protected(device):
         device.park()
         status = device.status()
@@ -88,38 +91,61 @@ def stop(context: CommandContext, selection: options.Selection) -> None:
     context.report(**_status_fields(status, section), left="parked", changed=True)
 
 
-@app.command("status")
+@app.command("status", cls=DeviceCommand)
 @command("modulator status")
-def status(context: CommandContext, selection: options.Selection) -> None:
+def status(context: CommandContext, selection: options.DeviceSelection) -> None:
     """Show the state of the modulator; moves and changes nothing."""
-    _, section, device = _device(context, selection)
+    chosen = _device(context, selection)
+    section = chosen.section
     context.devices_opened = True
-    now = device.status()
+    now = chosen.device.status()
     context.show(*_format_status(now, section))
     context.report(**_status_fields(now, section), changed=False)
 
 
-def _device(
-    context: CommandContext, selection: options.SystemSelection
-) -> tuple[SystemConfig, ModulatorConfig, TipTiltModulator]:
-    """The system's modulator, not open."""
+def _device(context: CommandContext, selection: options.SystemSelection) -> SelectedDevice[TipTiltModulator]:
+    """The modulator, not open."""
     from escape_hw.api.modulator import TipTiltModulator
-    from escape_hw.bench import build_device
 
-    config = context.load_config(selection)
-    section = config.devices.modulator
-    if section is None:
-        raise ConfigError(f"system '{config.system.name}' has no modulator, [devices.modulator]")
-    return config, section, build_device("modulator", config, TipTiltModulator)  # type: ignore[type-abstract]
+    return select_device(context, selection, "modulator", TipTiltModulator)  # type: ignore[type-abstract]
 
 
-def _format_modulation(modulation: Modulation, section: ModulatorConfig) -> str:
-    radius_lambda_d = modulation.radius_rad / section.rad_per_lambda_d
-    radius = f"{radius_lambda_d:.4g} lambda/D ({modulation.radius_rad * 1e6:.4g} urad)"
+def _requested_modulation(
+    chosen: SelectedDevice[TipTiltModulator],
+    radius: float | None,
+    radius_rad: float | None,
+    frequency_hz: float | None,
+) -> Modulation:
+    """The modulation of the options, completed by the configuration if there is one."""
+    from escape_hw.api.modulator import Modulation
+    from escape_hw.config.sensor import PyramidSection
+
+    if radius is not None and radius_rad is not None:
+        raise ConfigError("--radius and --radius-rad exclude each other; give one")
+    section: ModulatorConfig | None = chosen.section
+    if chosen.config is None or section is None:
+        if radius_rad is None or frequency_hz is None:
+            raise ConfigError("--radius-rad and --frequency: both are needed with --driver")
+        return Modulation(radius_rad, frequency_hz)
+    if radius_rad is None:
+        radius = chosen.config.sensor_as(PyramidSection).modulation if radius is None else radius
+        radius_rad = radius * section.rad_per_lambda_d
+    return Modulation(radius_rad, frequency_hz or section.frequency_hz)
+
+
+def _lambda_d(modulation: Modulation, section: ModulatorConfig | None) -> float | None:
+    """Radius on the pyramid in lambda/D; ``None`` without a system."""
+    return None if section is None else modulation.radius_rad / section.rad_per_lambda_d
+
+
+def _format_modulation(modulation: Modulation, section: ModulatorConfig | None) -> str:
+    radius, radius_lambda_d = f"{modulation.radius_rad * 1e6:.4g} urad", _lambda_d(modulation, section)
+    if radius_lambda_d is not None:
+        radius = f"{radius_lambda_d:.4g} lambda/D ({radius})"
     return f"{radius} at {modulation.frequency_hz:.6g} Hz"
 
 
-def _format_status(status: ModulatorStatus, section: ModulatorConfig) -> list[str]:
+def _format_status(status: ModulatorStatus, section: ModulatorConfig | None) -> list[str]:
     now, at = status.modulation, status.position_rad
     rows = [f"{status.info.model}, serial number {status.info.serial or 'unknown'}"]
     rows.append("at rest" if now is None else f"modulating: {_format_modulation(now, section)}")
@@ -128,9 +154,9 @@ def _format_status(status: ModulatorStatus, section: ModulatorConfig) -> list[st
     return [*rows, *(f"{key}: {value}" for key, value in status.details.items())]
 
 
-def _status_fields(status: ModulatorStatus, section: ModulatorConfig) -> dict[str, Any]:
+def _status_fields(status: ModulatorStatus, section: ModulatorConfig | None) -> dict[str, Any]:
     """The status in the command's document."""
     found = {"simulated": status.info.simulated, **asdict(status)}
     if status.modulation is not None:
-        found["modulation"]["radius_lambda_d"] = status.modulation.radius_rad / section.rad_per_lambda_d
+        found["modulation"]["radius_lambda_d"] = _lambda_d(status.modulation, section)
     return found

@@ -53,9 +53,13 @@ def poke_shape(dm: DeformableMirror, actuator: int, amplitude: float) -> NDArray
     Raises
     ------
     CommandRejected
-        It exceeds a limit; the message names the largest amplitude.
+        The actuator does not exist, or the shape exceeds a limit; the message names the largest amplitude.
     """
     shape = dm.flat
+    if actuator >= shape.size:
+        raise CommandRejected(
+            dm.name, f"actuator {actuator} does not exist; the mirror has 0 to {shape.size - 1}"
+        )
     shape[actuator] += amplitude
     reached, report = dm.check(shape)
     if not report.is_unchanged:

@@ -23,6 +23,7 @@ from escape_sim.optics.focal_plane import FocalPlane
 
 if TYPE_CHECKING:
     from escape_hw.config.devices import CameraConfig
+    from escape_hw.config.registry import DeviceContext
     from escape_hw.config.system import SystemConfig
 
 _BENCH_KEY = "simulated bench"
@@ -377,11 +378,11 @@ class SimAdaptiveSecondary(_Simulated[DMInfo], AdaptiveSecondary):
         )  # fmt: skip
 
 
-def _factory(
-    device: Callable[[str, SimBench], Device],
-) -> Callable[[str, SystemConfig, dict[str, object]], Device]:
+def _factory(device: Callable[[str, SimBench], Device]) -> Callable[[object, DeviceContext], Device]:
     """Entry point that creates a device on the shared bench of a system."""
-    return lambda name, config, shared: device(name, shared_bench(config, shared))
+    return lambda section, context: device(
+        context.name, shared_bench(context.require_system(), context.shared)
+    )
 
 
 make_mirror = _factory(SimMirror)

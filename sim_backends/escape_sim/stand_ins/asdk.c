@@ -1,7 +1,8 @@
 /* Stand-in of ALPAO's libasdk: one mirror, the C calls of asdkDM.h, strict about their order.
  *
  * Properties (set KEY VALUE): serial, actuators, range (refuse, ignore or accept values beyond 1),
- * errors_stay (1: reading an error does not remove it).
+ * errors_stay (1: reading an error does not remove it), triggers (0: no trigger inputs), trigger_in (state that
+ * another program has left). With a trigger, each asdkSendPattern needs TriggerIn set since the one before.
  */
 #define _GNU_SOURCE
 #include "stand_in.h"
@@ -54,7 +55,7 @@ static struct parameter parameters[] = {
 
 static asdkDM mirrors[MAX_DM];
 static char configured_serial[64];
-static int n_act, errors_stay;
+static int n_act, errors_stay, has_triggers, trigger_is_set;
 static enum range_mode range_mode;
 static struct {
     UInt number;
@@ -80,6 +81,7 @@ static void si_reset_device(void) {
     snprintf(configured_serial, sizeof configured_serial, "SIM97");
     n_act = 97;
     errors_stay = n_errors = 0;
+    has_triggers = trigger_is_set = 1;
     n_transfers = 0;
     range_mode = REFUSE;
     memset(applied_shape, 0, sizeof applied_shape);
@@ -90,6 +92,8 @@ static int si_set_property(const char *key, const char *value) {
         return snprintf(configured_serial, sizeof configured_serial, "%s", value) > 0;
     if (strcmp(key, "actuators") == 0) return (n_act = atoi(value)) >= 1 && n_act <= MAX_ACT;
     if (strcmp(key, "errors_stay") == 0) return (errors_stay = atoi(value)) >= 0;
+    if (strcmp(key, "triggers") == 0) return (has_triggers = atoi(value)) >= 0;
+    if (strcmp(key, "trigger_in") == 0) return parameter_of("TriggerIn")->value = atoi(value), 1;
     if (strcmp(key, "range") == 0) {
         static const char *const names[] = {"refuse", "ignore", "accept"};
         for (int k = 0; k < 3; k++)
@@ -242,6 +246,8 @@ EXPORT COMPL_STAT asdkSend(asdkDM *dm, const Scalar *v) {
         si_report_violation("asdkSend: a pattern is being sent; asdkStop first");
         return push_error(0x106, "asynchronous transfer");
     }
+    /* No edge ever comes here: the interface gives up. */
+    if (parameter_of("TriggerIn")->value > 0) return push_error(0x10E, "no trigger");
     int range_result = check_range("asdkSend", v, n_act);
     if (range_result == 0) return push_error(0x11, "value out of range");
     if (range_result > 0 && transfer(dm, v) != SUCCESS) return FAILURE;
@@ -260,6 +266,10 @@ EXPORT COMPL_STAT asdkSendPattern(asdkDM *dm, const Scalar *p, UInt n_pattern, U
     }
     if (check_range("asdkSendPattern", p, n_act * (int)n_pattern) == 0)
         return push_error(0x11, "value out of range");
+    if (parameter_of("TriggerIn")->value > 0) {
+        if (!trigger_is_set) return push_error(0x102, "time-out of the output");
+        trigger_is_set = 0;
+    }
     outcome = transfer(dm, p + (size_t)(n_pattern - 1) * (size_t)n_act);
     dm->playing = n_repeat ? (int)n_repeat : -1;
     /* A millisecond each, the order of this mirror's settling time. */
@@ -300,11 +310,14 @@ EXPORT COMPL_STAT asdkSet(asdkDM *dm, const char *name, Scalar value) {
     struct parameter *p = parameter_of(name);
     if (p == NULL) return push_error(0x10, "unknown command name");
     if (!p->sets) return push_error(0x10A, "not supported");
+    int is_trigger = strcmp(p->name, "TriggerIn") == 0;
+    if (is_trigger && !has_triggers) return push_error(0x10A, "not supported");
     if (!(value >= p->low && value <= p->high)) {
         si_report_violation("asdkSet: %s = %g, out of range", p->name, value);
         return push_error(0x11, "value out of range");
     }
     p->value = value;
+    if (is_trigger) trigger_is_set = 1;
     return SUCCESS;
 }
 

@@ -27,6 +27,7 @@ import numpy as np
 
 from escape_hw.api.camera import Camera, CameraSettings, Region
 from escape_hw.api.emulator import EmulatorRequest
+from escape_hw.config.registry import DeviceContext
 from escape_hw.errors import EscapeError, FrameTimeout
 from escape_hw.supervision import BackgroundThread
 from escape_sim.devices.twins import make_mirror, make_science_camera, make_wfs_camera, shared_bench
@@ -190,11 +191,11 @@ class StandInBenchServer:
             if kind == "mirror":
                 return _OK, struct.pack("=I", devices.dm.n_act), self._open_mirror()
             make = make_wfs_camera if kind == "wfs" else make_science_camera
-            camera = make(kind, self.config, self.shared).open()
+            camera = make(section, DeviceContext(kind, self.config, self.shared)).open()
             return _OK, struct.pack("=I", camera.info.bit_depth), _CameraEndpoint(camera)
 
     def _open_mirror(self) -> Callable[[RequestKind, bytes], Reply]:
-        mirror = make_mirror("dm", self.config, self.shared).open()
+        mirror = make_mirror(self.config.devices.dm, DeviceContext("dm", self.config, self.shared)).open()
         bench = shared_bench(self.config, self.shared)
 
         def handle_request(kind: RequestKind, payload: bytes) -> Reply:

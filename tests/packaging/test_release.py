@@ -1,0 +1,96 @@
+"""Files of a release agree: versions, tested and oldest dependencies, desktop entry, hosted run."""
+
+from __future__ import annotations
+
+import configparser
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+import escape_hw
+
+ROOT = Path(__file__).resolve().parents[2]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+
+
+def text(name: str) -> str:
+    return (ROOT / name).read_text("utf-8")
+
+
+def pins(lines: str) -> dict[str, str]:
+    found = re.findall(r"^([A-Za-z0-9_.-]+)==(\S+)$", lines, re.MULTILINE)
+    return {canonicalize_name(name): version for name, version in found}
+
+
+def test_every_place_has_the_same_version() -> None:
+    newest = re.search(r"^## \[(\d+\.\d+\.\d+)\] - (\d{4}-\d\d-\d\d)$", text("CHANGELOG.md"), re.MULTILINE)
+    citation = dict(
+        re.findall(r'^(version|date-released): "?([0-9.-]+)"?$', text("CITATION.cff"), re.MULTILINE)
+    )
+    assert newest is not None
+    assert newest[1] == citation["version"] == escape_hw.__version__
+    assert newest[2] == citation["date-released"]
+
+
+def test_tested_versions_satisfy_every_requirement() -> None:
+    tested = pins(text("constraints.txt"))
+    extras = PROJECT["optional-dependencies"]
+    wanted = [
+        *PROJECT["dependencies"],
+        *(one for name in ("gui", "sweep", "test", "docs", "dev") for one in extras[name]),
+    ]
+    for requirement in map(Requirement, wanted):
+        if requirement.name != PROJECT["name"]:
+            assert tested[canonicalize_name(requirement.name)] in requirement.specifier, requirement
+
+
+def test_the_oldest_versions_are_those_of_the_project() -> None:
+    done = subprocess.run(
+        [sys.executable, str(ROOT / ".ci" / "floor.py")],
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=60,
+    )
+    oldest = pins(done.stdout)
+    for requirement in map(Requirement, PROJECT["dependencies"]):
+        version = oldest[canonicalize_name(requirement.name)].removesuffix(".*")
+        assert version in requirement.specifier
+        assert f">={version}" in str(requirement.specifier)
+        assert not re.search(r"[<]|==|~=", str(requirement.specifier)), "no upper limits"
+
+
+def test_the_desktop_entry_starts_the_window() -> None:
+    parser = configparser.ConfigParser(interpolation=None)
+    parser.optionxform = str  # type: ignore[assignment,method-assign]
+    parser.read_string(text("desktop/escape.desktop"))
+    entry = parser["Desktop Entry"]
+    program, command = entry["Exec"].split()
+    assert program in PROJECT["scripts"]
+    assert (command, entry["Type"], entry["Terminal"]) == ("gui", "Application", "false")
+    assert (ROOT / "escape_gui" / f"{entry['Icon']}.svg").is_file()
+
+
+def test_the_hosted_run_is_the_local_one() -> None:
+    steps = re.findall(r"^ +- run: (.*)$", text(".github/workflows/ci.yml"), re.MULTILINE)
+    assert steps == [".ci/run"]
+
+
+@pytest.mark.parametrize("name", ["CONTRIBUTING.md", "SECURITY.md", "CHANGELOG.md"])
+def test_links_of_the_files_beside_the_readme(name: str) -> None:
+    for target in re.findall(r"\]\(([^)#]+)[^)]*\)", text(name)):
+        assert target.startswith("https://") or (ROOT / target).exists(), target
+
+
+def test_the_container_installs_what_is_there() -> None:
+    lines = text("Containerfile")
+    assert "constraints.txt" in lines
+    assert set(re.findall(r"'/source\[([a-z,]+)\]'", lines)[0].split(",")) <= set(
+        PROJECT["optional-dependencies"]
+    )

@@ -1,0 +1,90 @@
+"""Commands on one device that is named by its driver, without a system file."""
+
+from __future__ import annotations
+
+import pytest
+from asm_bench import emulator, port_of
+from command_line import document, escape
+from driver_bench import fresh, stand_in
+
+__all__ = ["document", "escape"]
+
+
+def alpao_words() -> list[str]:
+    fresh("asdk", "set serial BAX118")
+    return ["--driver", "alpao", "--serial", "BAX118", "--set", f"library={stand_in('asdk').path}"]
+
+
+def test_a_mirror_is_moved_by_its_driver(document) -> None:
+    words = alpao_words()
+    code, found, err = document("dm", "flat", *words)
+    assert (code, found["system"], found["simulated"]) == (0, None, True)
+    assert "this changes hardware, alpao BAX118: ramp to flat" in err
+    code, found, _ = document("dm", "poke", *words, 48, -0.05, "--seconds", 0)
+    assert (code, found["peak"], found["asked"]["actuator"]) == (0, 0.05, 48)
+    code, found, _ = document("dm", "wave", *words, "--seconds", 0.1)
+    assert code == 0
+    code, found, _ = document("dm", "status", *words, "--set", "limits.max_stroke=0.3")
+    assert (found["n_act"], found["stroke_m"], found["limits"]["max_stroke"]) == (97, None, 0.3)
+    assert not stand_in("asdk").violations
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "message"),
+    [
+        (["poke", "97", "0.1"], 3, "actuator 97 does not exist; the mirror has 0 to 96"),
+        (["poke", "0", "0.6"], 3, "a poke of 0.6 at actuator 0 is beyond its limits"),
+        (["flat", "--mode", "sim"], 2, "not with --driver"),
+        (["flat", "--set", "limits.max_stroke=2"], 2, "max_stroke is 2; it must lie in"),
+        (["flat", "--set", "trigger_in=up"], 2, "alpao.trigger_in: 'up'  must be"),
+        (["flat", "razor-shwfs"], 2, "unexpected extra argument"),
+    ],
+)
+def test_what_cannot_be_is_refused(escape, words, code, message) -> None:
+    verb, *rest = words
+    found, _, err = escape("dm", verb, *alpao_words(), *rest)
+    assert found == code, err
+    assert message in err
+
+
+def test_a_serial_number_needs_a_driver(escape) -> None:
+    code, _, err = escape("dm", "flat", "razor-shwfs", "--serial", "BAX118")
+    assert (code, "goes with --driver" in err) == (2, True)
+    code, _, err = escape("dm", "flat", "--driver", "ximea", "--serial", "1")
+    assert (code, "creates a XimeaCamera, not a DeformableMirror" in err) == (2, True)
+    code, _, err = escape("dm", "flat")
+    assert (code, "Missing argument" in err) == (2, True)
+
+
+def test_a_camera_is_read_by_its_driver(document, tmp_path) -> None:
+    fresh("m3api", "set serial 12345678")
+    words = ["--driver", "ximea", "--serial", "12345678", "--set", f"library={stand_in('m3api').path}"]
+    fast = ["--set", "frame_rate_hz=100.0", "--set", "region=[0, 0, 64, 32]"]
+    code, found, _ = document("camera", "snap", *words, *fast, "--frames", 2, "--out", tmp_path / "a.fits")
+    assert (code, found["shape"], found["settings"]["region"]["width"]) == (0, [32, 64], 64)
+    assert (tmp_path / "a.fits").is_file()
+    code, found, _ = document("camera", "settings", *words, *fast, "--exposure", 2e-3)
+    assert (code, found["settings"]["exposure_s"]) == (0, pytest.approx(2e-3))
+    code, found, _ = document("camera", "stream", *words, *fast, "--seconds", 0.05)
+    assert (code, found["status"]["lost"]) == (0, 0)
+
+
+def test_a_stage_is_turned_by_its_driver(document, escape) -> None:
+    words = ["--driver", "pi-e727", "--set", "kind=emulator"]
+    circle = ["--radius-rad", 1.4e-4, "--frequency", 303.0, "--seconds", 0]
+    code, found, _ = document("modulator", "start", *words, *circle)
+    assert (code, found["left"], found["asked"]["radius_rad"]) == (0, "parked", 1.4e-4)
+    assert document("modulator", "status", *words)[0] == 0
+    code, _, err = escape("modulator", "start", *words)
+    assert (code, "both are needed with --driver" in err) == (2, True)
+
+
+def test_a_secondary_is_set_by_its_driver(document) -> None:
+    with emulator() as made:
+        words = ["--driver", "asm", "--serial", "SIM336", "--set", f"port={port_of(made)}"]
+        code, found, _ = document("asm", "set", *words)
+        assert (code, found["after"]) == (0, "set")
+        assert document("asm", "status", *words)[1]["state"] == "set"
+        assert document("dm", "poke", *words, 0, 0.02, "--seconds", 0)[0] == 0
+        assert document("asm", "rest", *words)[1]["after"] == "rested"
+        assert not made.violations

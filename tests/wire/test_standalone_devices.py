@@ -1,0 +1,151 @@
+"""Drivers used alone, without a system file: geometry from the device, cautious limits, the same guard."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from asm_bench import emulator, port_of
+from driver_bench import fresh, stand_in
+
+import escape_hw
+from escape_drivers.alpao import AlpaoMirror
+from escape_drivers.asm import AsmMirror
+from escape_drivers.pi import PiModulator
+from escape_drivers.ximea import XimeaCamera
+from escape_hw.api.adaptive_secondary import ShellState
+from escape_hw.errors import ConfigError, DeviceError, NotOpen, SettingRejected
+from escape_hw.safety.limits import CAUTIOUS_LIMITS
+from escape_hw.testing import Check, Factory, parametrize_device_checks
+
+
+def mirror(**settings) -> AlpaoMirror:
+    fresh("asdk", "set serial BAX118")
+    return AlpaoMirror(serial="bax118", library=str(stand_in("asdk").path), **settings)
+
+
+def camera(**settings) -> XimeaCamera:
+    fresh("m3api", "set serial 12345678")
+    return XimeaCamera(serial="12345678", library=str(stand_in("m3api").path), **settings)
+
+
+def stage(**settings) -> PiModulator:
+    return PiModulator(kind="emulator", **settings)
+
+
+@parametrize_device_checks({"alpao": mirror, "ximea": camera, "pi-e727": stage})
+def test_contract(factory: Factory, check: Check) -> None:
+    check(factory)
+
+
+def test_a_mirror_takes_its_geometry_from_the_sdk() -> None:
+    dm = mirror()
+    with pytest.raises(NotOpen, match="number of actuators is known once it is open"):
+        dm.info  # noqa: B018
+    with dm:
+        assert (dm.info.n_act, dm.info.serial, dm.info.simulated) == (97, "bax118", True)
+        assert dm.info.layout is not None
+        assert dm.info.layout.shape == (11, 11)
+        assert np.ptp(dm.info.positions_m[:, 0]) == pytest.approx(10 * 1.5e-3)
+        assert math.isnan(dm.info.stroke_m)
+        assert dm.limits is CAUTIOUS_LIMITS
+    with mirror(pitch_m=2.5e-3, stroke_m=3e-6, layout="circle-11") as dm:
+        assert np.ptp(dm.info.positions_m[:, 0]) == pytest.approx(25e-3)
+        assert dm.info.stroke_m == 3e-6
+
+
+def test_a_mirror_of_an_unknown_layout_asks_for_it() -> None:
+    dm = mirror()
+    stand_in("asdk").script("set actuators 277")
+    with pytest.raises(DeviceError, match=r"has 277 actuators, and no layout .* give its layout"):
+        dm.open()
+    assert not dm.is_open
+
+
+def test_the_guard_limits_every_command_of_a_mirror_used_alone() -> None:
+    with mirror() as dm:
+        report = dm.send(np.full(97, 1.0))
+        assert np.abs(report.sent).max() <= 0.2, "slew"
+        for _ in range(10):
+            report = dm.send(np.where(np.arange(97) % 2, 1.0, -1.0))
+        assert np.abs(report.sent).sum() <= 20 + 1e-9
+        assert np.array_equal(stand_in("asdk").shape(97), report.sent)
+        with pytest.raises(escape_hw.errors.CommandRejected):
+            dm.send(np.full(97, np.nan))
+    assert not stand_in("asdk").violations
+
+
+def test_settings_of_a_device_used_alone_are_checked() -> None:
+    with pytest.raises(ConfigError, match=r"^alpao\.triger_in: unknown option \(did you mean 'trigger_in'\?"):
+        mirror(triger_in="off")
+    with pytest.raises(ConfigError, match="by its serial number only"):
+        AlpaoMirror(serial=" ")
+    with pytest.raises(ConfigError, match=r"ximea\.queue: 0  is out of range"):
+        camera(queue=0)
+    with pytest.raises(ConfigError, match=r"modulator\.port: 0  is out of range"):
+        PiModulator(host="10.0.0.1", port=0)
+
+
+def test_a_camera_takes_the_size_of_its_sensor_from_the_library() -> None:
+    with camera(exposure_s=2e-4, frame_rate_hz=100.0) as device:
+        rows, columns = device.info.sensor_shape
+        assert rows > 0
+        assert device.settings.region == escape_hw.Region(0, 0, columns, rows)
+        assert device.next_frame(5.0).data.shape == (rows, columns)
+    with camera(region=(16, 8, 64, 32), exposure_s=2e-4, frame_rate_hz=100.0) as device:
+        assert device.next_frame(5.0).data.shape == (32, 64)
+    with pytest.raises(DeviceError, match="sensor_px is 5 x 5"):
+        camera(sensor_px=(5, 5)).open()
+
+
+def test_a_stage_is_limited_to_a_small_tilt() -> None:
+    with stage() as device:
+        assert device.info.max_tilt_rad == 1e-3
+        with pytest.raises(SettingRejected):
+            device.modulate(escape_hw.Modulation(1.1e-3, 200.0))
+        assert device.modulate(escape_hw.Modulation(2e-4, 200.0)).frequency_hz > 0
+        device.park()
+
+
+def test_a_secondary_reports_everything_but_its_serial_number() -> None:
+    with emulator() as made:
+        port = port_of(made)
+        with pytest.raises(DeviceError, match="is 'SIM336', not 'OTHER'"):
+            AsmMirror("OTHER", port=port).open()
+        device = AsmMirror(serial="SIM336", port=port, reply_s=10.0)
+        with device:
+            assert device.state is ShellState.RUNNING
+            assert device.info.n_act == 336
+            assert 0 < device.info.stroke_m < 1
+            assert device.limits.max_stroke <= 0.5
+            actuator = int(np.setdiff1d(np.arange(336), device.limits.disabled)[0])
+            shape = device.flat
+            shape[actuator] = 0.02
+            assert device.send(shape).guard.is_unchanged
+        assert not made.violations
+
+
+def test_a_device_is_opened_by_the_name_of_its_driver() -> None:
+    fresh("asdk", "set serial BAX118")
+    path = str(stand_in("asdk").path)
+    with escape_hw.open_device("alpao", serial="BAX118", library=path) as dm:
+        assert isinstance(dm, AlpaoMirror)
+        assert dm.is_open
+    with pytest.raises(
+        ConfigError, match=r"driver 'alpao' cannot be created: .*AlpaoMirror failed with TypeErr"
+    ):
+        escape_hw.open_device("alpao")
+    with pytest.raises(ConfigError, match="'sim-alpao' works as a part of a system only"):
+        escape_hw.open_device("sim-alpao")
+
+
+def test_limits_of_a_device_used_alone_may_be_a_table() -> None:
+    fresh("asdk", "set serial BAX118")
+    words = {"serial": "BAX118", "library": str(stand_in("asdk").path)}
+    with escape_hw.open_device("alpao", limits={"max_stroke": 0.3}, **words) as dm:
+        assert dm.limits == replace(CAUTIOUS_LIMITS, max_stroke=0.3)
+    for wrong in ({"max_stork": 0.3}, {"max_stroke": 3}):
+        with pytest.raises(ConfigError, match="driver 'alpao': limits: "):
+            escape_hw.open_device("alpao", limits=wrong, **words)
