@@ -42,7 +42,10 @@ from escape_hw.supervision import process_start
 
 log = logging.getLogger(__name__)
 
-_POLL_MS = 50
+#: Period of the main loop, and while replies wait for slow clients.
+_POLL_MS, _BUSY_POLL_MS = 50, 5
+#: Requests of one connection that may wait for the engine; further ones are refused.
+_MAX_PENDING = 20
 
 
 class FrontEnd:
@@ -57,6 +60,7 @@ class FrontEnd:
             self._journal.folder / f"{config.system.name}.log", lambda line: transport.publish("log", line)
         )
         self._leases = LeaseManager(config.server.lease_s)
+        transport.on_disconnect = self._leases.remove_connection
         state = State(
             at_utc=format_utc(), server_pid=os.getpid(), version=get_software_version(),
             system=config.system.name, simulated=config.simulated, seed=config.system.seed,
@@ -86,7 +90,7 @@ class FrontEnd:
                 engine = supervisor.running_engine
                 if engine is not None:
                     poller.register(engine.connection.fileno(), zmq.POLLIN)
-                poller.poll(_POLL_MS)
+                poller.poll(_BUSY_POLL_MS if self._transport.flush() else _POLL_MS)
                 if engine is not None:
                     poller.unregister(engine.connection.fileno())
                     supervisor.receive_messages(engine)
@@ -161,11 +165,12 @@ class FrontEnd:
             if isinstance(request, requests.RegisterClient):
                 self._transport.send_reply(route, self._register(request, route.sender))
                 return
+            if request.verb in requests.SAFETY_VERBS:
+                self._forward_safety_request(incoming)
+                return
             client = self._leases.record_activity(request.client, route.sender)
             if request.verb in requests.LEASE_VERBS:
                 self._leases.require(client)
-            if request.verb in requests.SAFETY_VERBS:
-                log.warning("%s: %s", client.description, request.verb.replace("_", " "))
             match request:
                 case requests.GetLatestSample():
                     self._transport.send_reply(route, *self._latest(request))
@@ -178,6 +183,10 @@ class FrontEnd:
                     self._transport.send_reply(route, lease)
                 case requests.PlainRequest(verb="release_lease"):
                     self._leases.release(client)
+                    self._published.update()
+                    self._transport.send_reply(route, None)
+                case requests.PlainRequest(verb="goodbye"):
+                    self._leases.remove(client)
                     self._published.update()
                     self._transport.send_reply(route, None)
                 case requests.PlainRequest(verb="state"):
@@ -217,6 +226,13 @@ class FrontEnd:
         }  # fmt: skip
         return head, sample.data.tobytes()
 
+    def _forward_safety_request(self, incoming: IncomingRequest) -> None:
+        """Forward a safety request, from any connection: it needs neither registration nor control."""
+        verb, route = incoming.request.verb, incoming.route
+        sender = self._leases.describe_sender(incoming.request.client, route.sender)
+        log.warning("%s: %s", sender, verb.replace("_", " "))
+        self._forward(incoming)
+
     def _forward(self, incoming: IncomingRequest) -> None:
         """Forward a request to the engine."""
         engine = self._supervisor.running_engine
@@ -225,6 +241,9 @@ class FrontEnd:
             return
         if incoming.request.verb == "shutdown":
             self._supervisor.note_stop_request()
+        sender = incoming.route.sender
+        if sum(one.route.sender == sender for one, _ in self._pending.values()) >= _MAX_PENDING:
+            raise RequestRefused(f"{_MAX_PENDING} requests of this connection wait already; wait for replies")
         number = next(self._numbers)
         self._pending[number] = (incoming, time.monotonic())
         engine.send({"id": number, "request": incoming.request.model_dump(mode="json")})
