@@ -258,9 +258,8 @@ class Connection:
             return
         connected, self._closed = self.connected, True
         if self._registered or self._waits_for_place:
-            self._registered = self._waits_for_place = (
-                False  # no further heartbeat, which would register this client again
-            )
+            # No further heartbeat, which would register this client again.
+            self._registered = self._waits_for_place = False
             if connected:
                 with contextlib.suppress(EscapeError):
                     self._link.send_request({"verb": "goodbye", "client": self.client}, _GOODBYE_S)

@@ -87,7 +87,7 @@ def guarded(client: Connection) -> bool:
 
 def failsafe_of(served: Served) -> int:
     """Process number of the fail-safe process; 0 when there is none."""
-    words = ("-f", "escape_hw.server.safety.failsafe", "-P", str(served.pid))
+    words = ("-f", "escape_hw.server.safety.failsafe", "-P", str(served.front))
     found = subprocess.run(("pgrep", *words), capture_output=True, text=True, check=False).stdout.split()
     return int(found[0]) if found else 0
 
@@ -141,22 +141,42 @@ def test_a_front_that_was_killed_leaves_a_flat_mirror_and_a_note(system, bench, 
             until_idle(client)
             client.start("docrime", frames=10_000_000)
             wait_for(lambda: bool(list(tmp_path.rglob("run.state"))) and not spy.flat, "the mirror is poked")
+            front, engine = served.front, client.state.engine_pid
             served.kill()
             seconds = wait_for(lambda: spy.flat, "the mirror is flat")
-            wait_for(lambda: not served.engines(), "engine and fail-safe process end")
-            wait_for(lambda: not client.connected, "the client notices")
-            with pytest.raises(ServerGone):
-                client.start("docrime")
+            wait_for(lambda: served.front not in (0, front), "another front end")
+            # The same connection reaches it, and the mirror stays flat.
+            wait_for(lambda: client.state.engine_pid not in (0, engine), "another engine")
+            until_idle(client)
+            assert spy.flat
+            assert client.state.active_run is None
+            client.acquire()
+            assert client.plan("docrime", {"frames": 500}).frames == 500
         assert seconds < 30
         # The engine had the time to keep what was measured.
         (partial,) = tmp_path.rglob("im.partial.fits")
         assert load_matrix(partial).result.partial
-        served.start()
         with served.connect() as client:
             notes = " / ".join(client.state.notes)
         assert "did not end cleanly" in notes
         assert "docrime" in notes
         assert str(partial.parent) in notes
+
+
+def test_a_killed_supervisor_ends_the_server_with_a_flat_mirror(system, bench, tmp_path) -> None:
+    server, spy = bench
+    with on_metal(system, server, tmp_path) as served:
+        with served.connect(control=True) as client:
+            until_idle(client)
+            client.start("docrime", frames=10_000_000)
+            wait_for(lambda: not spy.flat, "the mirror is poked")
+            os.kill(served.pid, signal.SIGKILL)
+            wait_for(lambda: spy.flat, "the mirror is flat")
+            wait_for(lambda: not served.engines(), "front end, engine and fail-safe process end")
+            wait_for(lambda: not client.connected, "the client notices")
+            with pytest.raises(ServerGone):
+                client.start("docrime")
+        assert spy.flat
 
 
 @pytest.mark.slow
@@ -179,9 +199,9 @@ def test_ten_kills_at_random_moments_of_a_calibration(system, bench, tmp_path, s
                     os.kill(engine, signal.SIGKILL)
                     wait_for(lambda: guarded(client), "the fail-safe process has ended")
                 else:
+                    front = served.front
                     served.kill()
-                    wait_for(lambda: not served.engines(), "engine and fail-safe process end")
-                    served.start()
+                    wait_for(lambda old=front: served.front not in (0, old), "another front end")
             assert spy.last is None or spy.flat, (number, which)
             assert not segments(pid=engine), (number, which)
             whole(tmp_path)

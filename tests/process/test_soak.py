@@ -22,7 +22,7 @@ _PAGE = os.sysconf("SC_PAGE_SIZE")
 
 
 def resources(pid: int) -> tuple[int, int, int]:
-    """Private and shared resident memory in bytes, descriptors, and mappings of shared memory of a process."""
+    """Resident memory in bytes, descriptors, and mappings of shared memory of a process."""
     process = Path(f"/proc/{pid}")
     resident = int((process / "statm").read_text().split()[1]) * _PAGE
     mapped = sum("/dev/shm/" in line for line in (process / "maps").read_text().splitlines())

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 import time
 from collections.abc import Callable
 from typing import Any
@@ -35,7 +34,7 @@ class PublishedState:
         before = self.state
         self.state = (before if state is None else state).model_copy(
             update={
-                "serial": before.serial + 1, "server_pid": os.getpid(), "lease": self._leases.lease,
+                "serial": before.serial + 1, "server_pid": before.server_pid, "lease": self._leases.lease,
                 "clients": self._leases.count, "refused_requests": self._transport.refused,
                 "notes": before.notes,
             }

@@ -52,7 +52,12 @@ class FrontEnd:
     """Serves the clients of one system and supervises its engine."""
 
     def __init__(
-        self, config: SystemConfig, transport: ZmqTransport, runs: Path, read_folders: tuple[Path, ...] = ()
+        self,
+        config: SystemConfig,
+        transport: ZmqTransport,
+        runs: Path,
+        read_folders: tuple[Path, ...],
+        server_pid: int,
     ) -> None:
         self._config, self._transport = config, transport
         self._journal = ServerJournal(config.system.name)
@@ -62,7 +67,7 @@ class FrontEnd:
         self._leases = LeaseManager(config.server.lease_s)
         transport.on_disconnect = self._leases.remove_connection
         state = State(
-            at_utc=format_utc(), server_pid=os.getpid(), version=get_software_version(),
+            at_utc=format_utc(), server_pid=server_pid, version=get_software_version(),
             system=config.system.name, simulated=config.simulated, seed=config.system.seed,
             notes=self._journal.read_previous_end(),
         )  # fmt: skip
@@ -282,15 +287,22 @@ class ClientKeyCheck:
 class Server:
     """A listening server with its sockets and its entry in the user's list; a context manager.
 
-    It listens on local sockets and, with a ``port``, on TCP as well. ConfigError: the system is served
-    already, or the address is not available.
+    It listens on local sockets and, with a ``port``, on TCP as well. ``server_pid`` is the process that the
+    list names, by default this one; a later front end of that process has the same addresses. ConfigError:
+    the system is served already, or the address is not available.
     """
 
-    def __init__(self, config: SystemConfig, host: str = "127.0.0.1", port: int | None = None) -> None:
+    def __init__(
+        self,
+        config: SystemConfig,
+        host: str = "127.0.0.1",
+        port: int | None = None,
+        server_pid: int | None = None,
+    ) -> None:
         self._config, self._stack = config, ExitStack()
-        name, pid = config.system.name, os.getpid()
+        name, pid = config.system.name, os.getpid() if server_pid is None else server_pid
         running = find_server(name)
-        if running is not None and running.alive:
+        if running is not None and running.alive and running.pid != server_pid:
             raise ConfigError(f"'{name}' is already served by process {running.pid}; stop that server first")
         if running is not None:
             unregister_server(running)
@@ -325,7 +337,7 @@ class Server:
     def run(self, stop: StopSignal, runs: Path, read_folders: tuple[Path, ...] = ()) -> None:
         """Serve until ``stop`` is set; parameters as for :class:`FrontEnd`."""
         register_server(self.listing)
-        FrontEnd(self._config, self._transport, runs, read_folders).run(stop)
+        FrontEnd(self._config, self._transport, runs, read_folders, self.listing.pid).run(stop)
 
     def __enter__(self) -> Self:
         return self

@@ -1,0 +1,147 @@
+"""Supervises the front-end process: start, restart after its death, and end."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import json
+import logging
+import os
+import subprocess
+import time
+from pathlib import Path
+from typing import Any, Self
+
+from escape_hw.api.procedure import StopSignal
+from escape_hw.config.system import SystemConfig
+from escape_hw.errors import EscapeError
+from escape_hw.remote.address import ServerListing
+from escape_hw.remote.requests import error_from_document
+from escape_hw.server.frontend.engine_process import STOP_TIMEOUT_S
+from escape_hw.server.frontend.main import FrontEndSetup
+from escape_hw.supervision import Backoff, ChildProcess
+
+log = logging.getLogger(__name__)
+
+_FRONT_END = "escape_hw.server.frontend.main"
+#: Seconds that a front end may take to end: its engine ends before, and its fail-safe process after that.
+_STOP_TIMEOUT_S = 2 * STOP_TIMEOUT_S + 10.0
+_POLL_S = 0.05
+#: ``prctl`` option: orphaned descendants become children of this process.
+_PR_SET_CHILD_SUBREAPER = 36
+
+
+class FrontEndSupervisor:
+    """A front end that is started again when it dies; a context manager.
+
+    The engine of a dead front end flattens the mirror and ends; the next front end starts after that, with an
+    engine of its own and the same addresses, so that clients reconnect. It ends when the supervisor dies.
+
+    Attributes
+    ----------
+    listing
+        Entry of the server in the user's list, while it is entered.
+
+    Raises
+    ------
+    ConfigError
+        The system is served already, or the address is not available.
+    """
+
+    def __init__(
+        self, config: SystemConfig, host: str, port: int | None, runs: Path, read_folders: tuple[Path, ...]
+    ) -> None:
+        self._setup = FrontEndSetup(
+            config_text=config.to_toml(), host=host, port=port, runs=runs, read_folders=read_folders,
+            server_pid=os.getpid(),
+        )  # fmt: skip
+        self._process: ChildProcess | None = None
+        self.listing: ServerListing
+
+    def __enter__(self) -> Self:
+        """Start the front end."""
+        # Makes it possible to wait for the engine of a dead front end.
+        ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
+        try:
+            self.listing = self._start()
+        except BaseException:
+            self._stop()
+            raise
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stop()
+
+    def run(self, stop: StopSignal) -> None:
+        """Keep a front end running until ``stop`` is set or a client ends the server.
+
+        EscapeError: the front end died while it was stopped; its engine has made the mirror flat.
+        """
+        backoff = Backoff()
+        while (code := self._wait(stop, backoff)) != 0:
+            if self._process is not None:
+                log.error("the front end (process %d) died with code %s", self._process.pid, code)
+                self._process = None
+                _reap_orphans()
+            if stop.is_set():
+                raise EscapeError("the front end died while the server was stopped; look at the log")
+            if not backoff.is_over():
+                time.sleep(_POLL_S)
+                continue
+            pause_s = backoff.begin_attempt()
+            log.error("the front end is restarted, and not again within %g s", pause_s)
+            try:
+                self._start()
+            except (EscapeError, OSError) as error:
+                log.error("the front end cannot be started; next attempt in %g s: %s", pause_s, error)
+                self._stop()
+
+    def _wait(self, stop: StopSignal, backoff: Backoff) -> int:
+        """Wait for the end of the front end; returns its exit code, -1 when there is none."""
+        process = self._process
+        if process is None:
+            return -1
+        while (code := process.wait(_POLL_S)) is None:
+            backoff.mark_alive()
+            if stop.is_set():
+                _request_stop(process)
+        return code
+
+    def _start(self) -> ServerListing:
+        """Start a front end and wait until it listens."""
+        process = self._process = ChildProcess(_FRONT_END, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+        with contextlib.suppress(BrokenPipeError):
+            process.stdin.write(self._setup.model_dump_json().encode() + b"\n")
+            process.stdin.flush()
+        with process.stdout as output:
+            line = output.readline()
+        message: dict[str, Any] = json.loads(line) if line else {}
+        if "listing" in message:
+            return ServerListing(**message["listing"])
+        if "error" in message:
+            raise error_from_document(message["error"])
+        raise EscapeError(f"the front end ended at its start, with code {process.wait(_STOP_TIMEOUT_S)}")
+
+    def _stop(self) -> None:
+        """End the front end and wait for its processes."""
+        process, self._process = self._process, None
+        if process is not None:
+            _request_stop(process)
+            if not process.wait_or_kill(_STOP_TIMEOUT_S):
+                log.error("the front end did not end within %g s and was killed", _STOP_TIMEOUT_S)
+            _reap_orphans()
+
+
+def _request_stop(process: ChildProcess) -> None:
+    """Ask a front end to end: its standard input ends."""
+    with contextlib.suppress(OSError):
+        process.stdin.close()
+
+
+def _reap_orphans() -> None:
+    """Wait until engine, fail-safe process and recorder of a dead front end have ended."""
+    deadline = time.monotonic() + _STOP_TIMEOUT_S
+    with contextlib.suppress(ChildProcessError):
+        while time.monotonic() < deadline:
+            if os.waitpid(-1, os.WNOHANG) == (0, 0):
+                time.sleep(_POLL_S)
