@@ -7,6 +7,7 @@ import os
 import time
 import uuid
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -57,16 +58,20 @@ def test_a_client_that_floods_and_never_reads_stops_nothing(
 ) -> None:
     front, before = served.front, memory(served.front)
     wait_for(lambda: bench.latest("frames") is not None, "a frame")
+    requests = resolve(SYSTEM if address == "local" else address).requests
     for _ in range(3):
-        with zmq.Context() as context, context.socket(zmq.DEALER) as raw:
-            for option, value in ((zmq.LINGER, 0), (zmq.SNDHWM, 0), (zmq.RCVHWM, 1)):
-                raw.setsockopt(option, value)
-            raw.connect(resolve(SYSTEM if address == "local" else address).requests)
-            client = str(uuid.uuid4())
-            raw.send_multipart([b"1", hello(client)])
-            request = json.dumps({"verb": "latest_sample", "client": client, "stream": "frames"}).encode()
-            for _ in range(20_000):
-                raw.send_multipart([b"2", request])
+        with zmq.Context() as context, ExitStack() as stack:
+            for _ in range(8):
+                raw = stack.enter_context(context.socket(zmq.DEALER))
+                for option, value in ((zmq.LINGER, 0), (zmq.SNDHWM, 0), (zmq.RCVHWM, 1)):
+                    raw.setsockopt(option, value)
+                raw.connect(requests)
+                client = str(uuid.uuid4())
+                raw.send_multipart([b"1", hello(client)])
+                document = {"verb": "latest_sample", "client": client, "stream": "frames"}
+                request = json.dumps(document).encode()
+                for _ in range(5_000):
+                    raw.send_multipart([b"2", request])
             # Others are served meanwhile.
             assert bench.plan("docrime", {"frames": 500}).frames == 500
             time.sleep(1)
