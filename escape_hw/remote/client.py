@@ -59,6 +59,7 @@ class RemoteRun:
 
     def __init__(self, connection: Connection, id: int, name: str) -> None:
         self._connection, self.id, self.name = connection, id, name
+        self._engine_pid = connection.state.engine_pid
 
     def __repr__(self) -> str:
         ended = self.ended
@@ -131,10 +132,16 @@ class RemoteRun:
     def _require_engine(self) -> None:
         """Raise when the engine has died, which ends its run without a further message."""
         state = self._connection.state
-        if state.active_run is not None or state.fault is None or state.engine_pid:
+        if state.engine_pid:
+            if self._engine_pid in (0, state.engine_pid):
+                return
+            reason = " / ".join(state.notes) or f"process {state.engine_pid} replaces it"
+        elif state.fault is not None:
+            reason = state.fault.reason
+        else:
             return
         if self._connection.wait_for(self.id, 0.0) is None:
-            raise CalibrationError(f"run {self.id} ({self.name}) ended with its engine: {state.fault.reason}")
+            raise CalibrationError(f"run {self.id} ({self.name}) ended with its engine: {reason}")
 
     def _result(self, ended: FinishedRun) -> Any:
         if ended.finish is Finish.FAILED:

@@ -136,10 +136,11 @@ def test_the_command_line_is_told_that_a_server_holds_the_hardware(
 
 def test_a_front_that_was_killed_leaves_a_flat_mirror_and_a_note(system, bench, tmp_path) -> None:
     server, spy = bench
-    with on_metal(system, server, tmp_path) as served:
+    # Longer than the path of a socket may be: the sockets are in a temporary folder.
+    with on_metal(system, server, tmp_path / ("long" * 20)) as served:
         with served.connect(control=True) as client:
             until_idle(client)
-            client.start("docrime", frames=10_000_000)
+            run = client.start("docrime", frames=10_000_000)
             wait_for(lambda: bool(list(tmp_path.rglob("run.state"))) and not spy.flat, "the mirror is poked")
             front, engine = served.front, client.state.engine_pid
             served.kill()
@@ -150,8 +151,12 @@ def test_a_front_that_was_killed_leaves_a_flat_mirror_and_a_note(system, bench, 
             until_idle(client)
             assert spy.flat
             assert client.state.active_run is None
+            with pytest.raises(CalibrationError, match="ended with its engine: the previous server"):
+                run.wait(60)
             client.acquire()
-            assert client.plan("docrime", {"frames": 500}).frames == 500
+            assert client.start("docrime", frames=500).id == run.id + 1
+            wait_for(lambda: any("run 2: " in line.text for line in client.log_after(-1)), "its line of the log")
+            client.abort()
         assert seconds < 30
         # The engine had the time to keep what was measured.
         (partial,) = tmp_path.rglob("im.partial.fits")

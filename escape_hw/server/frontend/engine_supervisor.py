@@ -140,8 +140,8 @@ class EngineSupervisor:
             return
         self._on_message(message)
         if "run" in message:
-            self._setup = self._setup.model_copy(update={"first_run_id": message["run"]["id"] + 1})
             self._journal.write(message["run"])
+            self._setup = self._setup.model_copy(update={"first_run_id": self._journal.last_run_id + 1})
         elif "ended" in message:
             self._journal.write(None)
 

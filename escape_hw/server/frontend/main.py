@@ -1,17 +1,17 @@
 """The front-end process; ``frontend.supervisor`` starts it, and starts it again when it dies.
 
 Its standard input holds the settings, one line of JSON, and ends when the server has to end. Standard output
-gets one line of JSON: ``{"listing": ...}`` when it listens, or ``{"error": ...}``.
+gets one line of JSON: an empty object when it listens, or ``{"error": ...}``.
 """
 
 from __future__ import annotations
 
 import json
+import logging
 import os
 import signal
 import sys
 from collections.abc import Mapping
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +19,12 @@ from pydantic import BaseModel, ConfigDict
 
 from escape_hw.config.loader import load_text
 from escape_hw.errors import EscapeError
+from escape_hw.remote.address import Endpoint
 from escape_hw.remote.requests import error_to_document
-from escape_hw.server.frontend.front_end import Server
+from escape_hw.server.frontend.front_end import FrontEnd, listening_transport
 from escape_hw.supervision import watch_standard_input
+
+log = logging.getLogger(__name__)
 
 
 class FrontEndSetup(BaseModel):
@@ -31,6 +34,8 @@ class FrontEndSetup(BaseModel):
 
     #: The system's configuration, TOML.
     config_text: str
+    #: Local sockets.
+    local: Endpoint
     #: Address and port of TCP; ``None`` for local sockets only.
     host: str
     port: int | None
@@ -39,6 +44,8 @@ class FrontEndSetup(BaseModel):
     read_folders: tuple[Path, ...]
     #: Process of the server, which supervises this one.
     server_pid: int
+    #: Number of the first log line and state: later than those of the front end before.
+    first_number: int = 0
 
 
 def main() -> None:
@@ -56,13 +63,21 @@ def main() -> None:
     setup = FrontEndSetup.model_validate_json(_read_line())
     stop = watch_standard_input()
     signal.signal(signal.SIGTERM, lambda *_: stop.set())
+    listening = False
     try:
-        config = load_text(setup.config_text)
-        with Server(config, setup.host, setup.port, setup.server_pid) as server:
-            send({"listing": asdict(server.listing)})
-            server.run(stop, setup.runs, setup.read_folders)
+        with listening_transport(setup.local, setup.host, setup.port) as transport:
+            front_end = FrontEnd(
+                load_text(setup.config_text), transport, setup.runs, setup.read_folders, setup.server_pid,
+                setup.first_number,
+            )  # fmt: skip
+            send({})
+            listening = True
+            front_end.run(stop)
     except EscapeError as error:
-        send({"error": error_to_document(error)})
+        if listening:
+            log.critical("%s", error)
+        else:
+            send({"error": error_to_document(error)})
         sys.exit(1)
 
 

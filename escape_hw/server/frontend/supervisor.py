@@ -14,12 +14,19 @@ from typing import Any, Self
 
 from escape_hw.api.procedure import StopSignal
 from escape_hw.config.system import SystemConfig
-from escape_hw.errors import EscapeError
-from escape_hw.remote.address import ServerListing
+from escape_hw.errors import ConfigError, EscapeError
+from escape_hw.remote.address import (
+    ServerListing,
+    find_server,
+    local_endpoint,
+    register_server,
+    tcp_endpoint,
+    unregister_server,
+)
 from escape_hw.remote.requests import error_from_document
 from escape_hw.server.frontend.engine_process import STOP_TIMEOUT_S
 from escape_hw.server.frontend.main import FrontEndSetup
-from escape_hw.supervision import Backoff, ChildProcess
+from escape_hw.supervision import Backoff, ChildProcess, process_start
 
 log = logging.getLogger(__name__)
 
@@ -27,6 +34,8 @@ _FRONT_END = "escape_hw.server.frontend.main"
 #: Seconds that a front end may take to end: its engine ends before, and its fail-safe process after that.
 _STOP_TIMEOUT_S = 2 * STOP_TIMEOUT_S + 10.0
 _POLL_S = 0.05
+#: Log lines and states of a restarted front end have larger numbers than those before, which clients have.
+_NUMBERS_OF_A_FRONT_END = 10**9
 #: ``prctl`` option: orphaned descendants become children of this process.
 _PR_SET_CHILD_SUBREAPER = 36
 
@@ -40,7 +49,7 @@ class FrontEndSupervisor:
     Attributes
     ----------
     listing
-        Entry of the server in the user's list, while it is entered.
+        Entry of the server in the user's list while it is entered, also while a front end is restarted.
 
     Raises
     ------
@@ -51,26 +60,36 @@ class FrontEndSupervisor:
     def __init__(
         self, config: SystemConfig, host: str, port: int | None, runs: Path, read_folders: tuple[Path, ...]
     ) -> None:
+        name, pid = config.system.name, os.getpid()
+        running = find_server(name)
+        if running is not None and running.alive:
+            raise ConfigError(f"'{name}' is already served by process {running.pid}; stop that server first")
+        if running is not None:
+            unregister_server(running)
+        local = local_endpoint(name, pid)
+        tcp = "" if port is None else tcp_endpoint(host, port).requests
+        self.listing = ServerListing(name, pid, process_start(pid) or 0, local.requests, local.events, tcp)
         self._setup = FrontEndSetup(
-            config_text=config.to_toml(), host=host, port=port, runs=runs, read_folders=read_folders,
-            server_pid=os.getpid(),
+            config_text=config.to_toml(), local=local, host=host, port=port, runs=runs,
+            read_folders=read_folders, server_pid=pid,
         )  # fmt: skip
         self._process: ChildProcess | None = None
-        self.listing: ServerListing
 
     def __enter__(self) -> Self:
         """Start the front end."""
         # Makes it possible to wait for the engine of a dead front end.
         ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
         try:
-            self.listing = self._start()
+            self._start()
+            register_server(self.listing)
         except BaseException:
-            self._stop()
+            self.__exit__()
             raise
         return self
 
     def __exit__(self, *_: object) -> None:
         self._stop()
+        unregister_server(self.listing)
 
     def run(self, stop: StopSignal) -> None:
         """Keep a front end running until ``stop`` is set or a client ends the server.
@@ -82,6 +101,9 @@ class FrontEndSupervisor:
             if self._process is not None:
                 log.error("the front end (process %d) died with code %s", self._process.pid, code)
                 self._process = None
+                self._setup = self._setup.model_copy(
+                    update={"first_number": self._setup.first_number + _NUMBERS_OF_A_FRONT_END}
+                )
                 _reap_orphans()
             if stop.is_set():
                 raise EscapeError("the front end died while the server was stopped; look at the log")
@@ -107,7 +129,7 @@ class FrontEndSupervisor:
                 _request_stop(process)
         return code
 
-    def _start(self) -> ServerListing:
+    def _start(self) -> None:
         """Start a front end and wait until it listens."""
         process = self._process = ChildProcess(_FRONT_END, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
         with contextlib.suppress(BrokenPipeError):
@@ -115,12 +137,11 @@ class FrontEndSupervisor:
             process.stdin.flush()
         with process.stdout as output:
             line = output.readline()
-        message: dict[str, Any] = json.loads(line) if line else {}
-        if "listing" in message:
-            return ServerListing(**message["listing"])
+        if not line:
+            raise EscapeError(f"the front end ended at its start, with code {process.wait(_STOP_TIMEOUT_S)}")
+        message: dict[str, Any] = json.loads(line)
         if "error" in message:
             raise error_from_document(message["error"])
-        raise EscapeError(f"the front end ended at its start, with code {process.wait(_STOP_TIMEOUT_S)}")
 
     def _stop(self) -> None:
         """End the front end and wait for its processes."""
