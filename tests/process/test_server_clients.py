@@ -52,7 +52,7 @@ def memory(pid: int) -> int:
     return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
-@pytest.mark.parametrize("address", ["local", f"tcp://127.0.0.1:{PORT}"])
+@pytest.mark.parametrize("address", ["local", f"tcp://127.0.0.1:{PORT}"], ids=["local", "tcp"])
 def test_a_client_that_floods_and_never_reads_stops_nothing(
     served: Served, bench: Connection, address: str
 ) -> None:

@@ -155,7 +155,9 @@ def test_a_front_that_was_killed_leaves_a_flat_mirror_and_a_note(system, bench, 
                 run.wait(60)
             client.acquire()
             assert client.start("docrime", frames=500).id == run.id + 1
-            wait_for(lambda: any("run 2: " in line.text for line in client.log_after(-1)), "its line of the log")
+            wait_for(
+                lambda: any("run 2: " in line.text for line in client.log_after(-1)), "its line of the log"
+            )
             client.abort()
         assert seconds < 30
         # The engine had the time to keep what was measured.
