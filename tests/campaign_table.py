@@ -36,7 +36,9 @@ class Campaign:
         """Record the row of the table; fails when a promise was broken."""
         counts = [f"{number} {outcome}" for outcome, number in sorted(self.outcomes.items())]
         broken = f"**{len(self.failures)} failures**" if self.failures else "no failure"
-        self._record(_PROPERTY, (what, self.outcomes.total() + len(self.failures), "; ".join([broken, *counts])))
+        self._record(
+            _PROPERTY, (what, self.outcomes.total() + len(self.failures), "; ".join([broken, *counts]))
+        )
         assert not self.failures, "\n".join([f"{len(self.failures)} failures", *self.failures[:20]])
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import random
 import warnings
 from collections.abc import Callable
@@ -12,7 +13,7 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from campaign_table import Campaign
-from test_damaged_files import archive, array, damage, read_toml
+from test_damaged_files import array, damage, read_toml
 
 from escape_hw.cli import main
 from escape_hw.config.bundled import bundled_text
@@ -42,6 +43,13 @@ loop:
 wfs: {width: 128, height: 128}
 wfc: {numActuators: 97, numModes: 94, m2cFile: m2c.npy}
 """
+
+
+def archive() -> bytes:
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, data=np.arange(50.0))
+    return buffer.getvalue()
+
 
 #: Values that replace a card of a header or an element of an array.
 CARDS = ("", "x", "T", -1, 0, 3, 10**18, 1.5, -1e300, True, False, "nan", "[[[", "<b>", "9" * 60)
@@ -73,7 +81,9 @@ def craft(path: Path, rng: random.Random) -> None:
             case _ if hdu.data is not None and hdu.data.dtype.names:
                 column = hdu.data[rng.choice(hdu.data.dtype.names)]
                 if column.size and column.dtype.kind in "fiu":
-                    column.flat[rng.randrange(column.size)] = np.array(rng.choice(ELEMENTS)).astype(column.dtype)
+                    column.flat[rng.randrange(column.size)] = np.array(rng.choice(ELEMENTS)).astype(
+                        column.dtype
+                    )
     hdus.writeto(path, overwrite=True, checksum=True, output_verify="ignore")
 
 
@@ -112,9 +122,7 @@ def attempt(campaign: Campaign, what: str, read: Callable[[], object]) -> None:
 
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("kind", PRODUCTS)
-def test_products(
-    campaign: Campaign, tmp_path: Path, kind: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_products(campaign: Campaign, tmp_path: Path, kind: str, capsys: pytest.CaptureFixture[str]) -> None:
     save, readers = PRODUCTS[kind]
     good = save(tmp_path / "good.fits").read_bytes()
     rng, noise = random.Random(SEED), np.random.default_rng(SEED)
