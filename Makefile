@@ -12,16 +12,19 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet
 # One thread per process: two test processes whose linear algebra also starts threads slow each other down.
 ONE_THREAD := OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 NUMBA_NUM_THREADS=1 MPLBACKEND=Agg
 
-.PHONY: help run test check docs perf clean
+.PHONY: help run test test-all check docs perf clean
 
 help: ## List the targets
-	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*##/\t/'
+	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*##/\t/'
 
 run: $(VENV)/run.stamp ## Calibrate the simulated RAZOR bench, close the loop, write a report
 	$(BIN)/escape reproduce shwfs $(ARGS)
 
 test: $(VENV)/test.stamp ## Run the tests
 	$(ONE_THREAD) $(BIN)/python -m pytest -n 2 --dist loadgroup $(ARGS)
+
+test-all: $(VENV)/test.stamp ## Run all tests without devices: slow ones and campaigns, too
+	$(ONE_THREAD) $(BIN)/python -m pytest -n 2 --dist loadgroup -m "not hardware and not screenshots" $(ARGS)
 
 check: $(VENV)/dev.stamp ## Check style, types and layers
 	$(BIN)/ruff check .

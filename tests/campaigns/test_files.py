@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import random
-import warnings
 from collections.abc import Callable
 from pathlib import Path
 
@@ -26,7 +26,7 @@ from escape_hw.io.interchange.pyrtc.files import read_file
 
 pytestmark = [pytest.mark.campaign, pytest.mark.timeout(3000)]
 
-SEED, NUMBER = 1500, 60
+SEED, NUMBER = 1500, 200
 
 YAML = b"""slopes:
   type: SHWFS
@@ -132,10 +132,9 @@ def test_products(campaign: Campaign, tmp_path: Path, kind: str, capsys: pytest.
             path.write_bytes(damage(good, noise))
         else:
             path.write_bytes(good)
-            try:
+            # Astropy does not write everything; what it wrote is read.
+            with contextlib.suppress(Exception):
                 craft(path, rng)
-            except Exception:  # astropy does not write everything; what it wrote is read
-                pass
         what = f"{kind} {number}"
         for read in readers:
             attempt(campaign, what, lambda read=read, path=path: read(path))
@@ -146,8 +145,7 @@ def test_products(campaign: Campaign, tmp_path: Path, kind: str, capsys: pytest.
 def show(campaign: Campaign, what: str, path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """``escape show`` of a file."""
     capsys.readouterr()
-    with pytest.raises(SystemExit) as ended, warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with pytest.raises(SystemExit) as ended:
         main(["show", str(path)])
     out, err = capsys.readouterr()
     code = ended.value.code or 0

@@ -23,7 +23,7 @@ __all__ = ["bench"]
 
 pytestmark = [pytest.mark.campaign, pytest.mark.timeout(3000)]
 
-SEED, TRIALS, KILLS = 22, 2, 2
+SEED, TRIALS, KILLS = 22, 6, 8
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGPIPE)
 #: Seconds between a kill and the next one, at most.
 LONGEST_S = 4.0

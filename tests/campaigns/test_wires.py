@@ -1,4 +1,4 @@
-"""Faults on the wires of an adaptive secondary (TCP) and a modulator (TCP, serial line), at random moments."""
+"""Faults of the wires to an adaptive secondary (TCP) and a modulator (TCP, serial), at random moments."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ pytestmark = [pytest.mark.campaign, pytest.mark.timeout(3000)]
 
 SEED = 1400
 #: Trials, and faults of each.
-N_ASM, N_E727, MOST_FAULTS = 16, 8, 3
+N_ASM, N_E727, MOST_FAULTS = 120, 60, 3
 #: Faults of the secondary's link, and of the mirror.
 LINK = ("close", "reset", "stall", "delay:0.3", "truncate", "crc", "stale", "double", "garbage")
 MIRROR = ("skip", "contaminate:17", "unreadable:30", "overcurrent:40", "watchdog", "trip")
@@ -51,7 +51,7 @@ def wait_for(condition: Callable[[], bool]) -> bool:
 
 # --------------------------------------------------------------------- the adaptive secondary
 def use_secondary(fault: str) -> str:
-    """A session on an emulated secondary with faults; the outcome, which begins with ``failed`` if it is none."""
+    """A session on an emulated secondary with faults; its outcome begins with ``failed`` if it is bad."""
     options = {"transition_speed": "1000", "hold_s": "0.3", "rest_s": "1.0", "fault": fault}
     emulator = make_emulator(EmulatorRequest(port=0, options=options))
     assert isinstance(emulator, AsmEmulator)
