@@ -97,37 +97,43 @@ class FrontEndSupervisor:
         EscapeError: the front end died while it was stopped; its engine has made the mirror flat.
         """
         backoff = Backoff()
-        while (code := self._wait(stop, backoff)) != 0:
+        while True:
             if self._process is not None:
-                log.error("the front end (process %d) died with code %s", self._process.pid, code)
-                self._process = None
-                self._setup = self._setup.model_copy(
-                    update={"first_number": self._setup.first_number + _NUMBERS_OF_A_FRONT_END}
-                )
-                _reap_orphans()
+                code = self._wait(self._process, stop, backoff)
+                if code == 0:
+                    return
+                self._clean_up(self._process, code)
             if stop.is_set():
                 raise EscapeError("the front end died while the server was stopped; look at the log")
-            if not backoff.is_over():
+            if backoff.is_over():
+                self._restart(backoff)
+            else:
                 time.sleep(_POLL_S)
-                continue
-            pause_s = backoff.begin_attempt()
-            log.error("the front end is restarted, and not again within %g s", pause_s)
-            try:
-                self._start()
-            except (EscapeError, OSError) as error:
-                log.error("the front end cannot be started; next attempt in %g s: %s", pause_s, error)
-                self._stop()
 
-    def _wait(self, stop: StopSignal, backoff: Backoff) -> int:
-        """Wait for the end of the front end; returns its exit code, -1 when there is none."""
-        process = self._process
-        if process is None:
-            return -1
+    def _wait(self, process: ChildProcess, stop: StopSignal, backoff: Backoff) -> int:
+        """Wait for the end of the front end, requested when ``stop`` is set; returns its exit code."""
         while (code := process.wait(_POLL_S)) is None:
             backoff.mark_alive()
             if stop.is_set():
                 _request_stop(process)
         return code
+
+    def _clean_up(self, process: ChildProcess, code: int) -> None:
+        """Wait for the end of the processes of a front end that died."""
+        log.error("the front end (process %d) died with code %s", process.pid, code)
+        self._process = None
+        first_number = self._setup.first_number + _NUMBERS_OF_A_FRONT_END
+        self._setup = self._setup.model_copy(update={"first_number": first_number})
+        _reap_orphans()
+
+    def _restart(self, backoff: Backoff) -> None:
+        pause_s = backoff.begin_attempt()
+        log.error("the front end is restarted, and not again within %g s", pause_s)
+        try:
+            self._start()
+        except (EscapeError, OSError) as error:
+            log.error("the front end cannot be started; next attempt in %g s: %s", pause_s, error)
+            self._stop()
 
     def _start(self) -> None:
         """Start a front end and wait until it listens."""
