@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 from serving import Served, serving, until_idle, wait_for
-from stand_in_bench import OPTIONS, guarded, on_metal, whole
+from stand_in_bench import OPTIONS, bench, guarded, on_metal, whole
 
 from escape_hw.errors import CalibrationError, RequestRefused, ServerGone
 from escape_hw.io.fits.matrix import load_matrix
@@ -17,6 +17,8 @@ from escape_hw.remote.address import ServerListing, local_endpoint, register_ser
 from escape_hw.remote.state import Phase
 from escape_hw.streams.segments import segments
 from escape_hw.supervision import process_start
+
+__all__ = ["bench"]
 
 
 def test_the_fail_safe_process_flattens_the_mirror_of_a_killed_engine(system, bench, tmp_path) -> None:
