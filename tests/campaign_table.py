@@ -1,6 +1,7 @@
 """Table of the campaigns: what was tried, how often, with which result.
 
-``pytest -m campaign --campaign-table docs/safety.md`` writes it between two marks of that page.
+``pytest -m campaign --campaign-table docs/safety.md`` writes it between two marks of that page; rows of campaigns that
+did not run stay.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import pytest
 
 BEGIN, END = "<!-- campaigns: begin -->", "<!-- campaigns: end -->"
 _PROPERTY = "campaign"
+_HEAD = ("| tried | times | result | run of |", "|---|---:|---|---|")
 
 
 class Campaign:
@@ -56,18 +58,27 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
     reports = [*terminalreporter.getreports("passed"), *terminalreporter.getreports("failed")]
-    rows = [
-        (report.nodeid, row) for report in reports for key, row in report.user_properties if key == _PROPERTY
-    ]
+    day = time.strftime("%Y-%m-%d", time.gmtime())
+    rows = {
+        str(what): f"| {what} | {number} | {result} | {day} |"
+        for report in reports
+        for key, (what, number, result) in report.user_properties
+        if key == _PROPERTY
+    }
     if not rows:
         return
-    at = f"Run of {time.strftime('%Y-%m-%d', time.gmtime())}."
-    table = [at, "", "| tried | times | result |", "|---|---:|---|"]
-    table += [f"| {what} | {number} | {result} |" for _, (what, number, result) in sorted(rows)]
     terminalreporter.section("campaigns")
-    terminalreporter.write_line("\n".join(table))
+    terminalreporter.write_line("\n".join(rows.values()))
     page: Path | None = config.getoption("--campaign-table")
     if page is not None:
         before, rest = page.read_text(encoding="utf-8").split(BEGIN)
-        after = rest.split(END)[1]
-        page.write_text("\n".join([f"{before}{BEGIN}", "", *table, "", f"{END}{after}"]), encoding="utf-8")
+        table, after = rest.split(END)
+        # Rows of campaigns that did not run now stay.
+        old = {
+            line.split(" | ")[0].removeprefix("| "): line
+            for line in table.splitlines()
+            if line.count("|") > 1
+        }
+        old = {what: line for what, line in old.items() if line not in _HEAD}
+        lines = [*_HEAD, *(line for _, line in sorted({**old, **rows}.items()))]
+        page.write_text("\n".join([f"{before}{BEGIN}", "", *lines, "", f"{END}{after}"]), encoding="utf-8")

@@ -167,14 +167,16 @@ class EngineSupervisor:
             engine.maintain_failsafe(failsafe_is_running)
         state = self._published.state
         # Compilation on a busy computer may delay an engine, which is harmless while the mirror is flat.
-        moving = state.mirror.peak > 0 or state.loop.closed
+        # The state may be the last one of an engine that died, whose mirror was made flat since.
+        is_current = state.engine_pid == engine.process.pid
+        moving = is_current and (state.mirror.peak > 0 or state.loop.closed)
         limit = self._limits.engine_silence_s if moving else IDLE_SILENCE_LIMIT_S
         silence = now - engine.last_message_s
         if silence > limit:
             self._kill(engine, f"the engine was silent for {silence:.1f} s (limit {limit:g} s)")
         elif self._stop_requested_s is not None and now - self._stop_requested_s > STOP_TIMEOUT_S:
             self._kill(engine, f"the engine did not end within {STOP_TIMEOUT_S:g} s")
-        elif state.mirror.peak > 0 and oldest_safety_request_s > _SAFETY_TIMEOUT_S:
+        elif is_current and state.mirror.peak > 0 and oldest_safety_request_s > _SAFETY_TIMEOUT_S:
             self._kill(engine, f"the engine did not make the mirror flat within {_SAFETY_TIMEOUT_S:g} s")
 
     def _kill(self, engine: EngineProcess, reason: str) -> None:
