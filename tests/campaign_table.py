@@ -1,7 +1,7 @@
 """Table of the campaigns: what was tried, how often, with which result.
 
-``pytest -m campaign --campaign-table docs/safety.md`` writes it between two marks of that page; rows of campaigns that
-did not run stay.
+``pytest -m campaign --campaign-table docs/safety.md`` writes it between two marks of that page; rows of
+campaigns that did not run stay.
 """
 
 from __future__ import annotations

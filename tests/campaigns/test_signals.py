@@ -72,13 +72,14 @@ def test_a_signal_to_a_calibration(
             ended = running.stop(*numbers, pause_s=1.0)
         finally:
             running.kill()
+        # Before the first line of ESCAPE, Python ends as a signal demands.
         killed_at_start = not measuring and spy.last is None and ended.code in (-number, -signal.SIGINT)
         problem = check_data(out, required=measuring)
         if spy.last is not None and not spy.flat:
             problem = "the mirror is not flat"
-        elif ended.code != 130 and not killed_at_start:
+        elif not killed_at_start and ended.code != 130:
             problem = f"exit code {ended.code}"
-        elif any("Traceback" in one for one in ended.lines):
+        elif not killed_at_start and any("Traceback" in one for one in ended.lines):
             problem = "traceback"
         if problem:
             campaign.fail(f"trial {trial}: {problem}: {ended.lines[-8:]}")
