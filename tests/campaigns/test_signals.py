@@ -54,13 +54,17 @@ def test_a_signal_to_a_calibration(
     """Half of them while it measures, half at any moment after the start."""
     server, spy = bench
     rng = random.Random(SEED + number)
+    # Where no other server is listed.
+    runtime = tmp_path / "runtime"
+    runtime.mkdir(mode=0o700)
     options = [word for option in OPTIONS for word in ("--set", option)]
     for trial in range(TRIALS):
         out, measuring = tmp_path / f"run-{trial}", trial % 2 == 0
         words = ["calibrate", system, "--mode", "hardware", *options, "--method", "docrime"]
         spy.last = None
         running = Running(
-            [*words, "--frames", 10_000_000, "--out", out, "--json"], {**environment, **server.environment}
+            [*words, "--frames", 10_000_000, "--out", out, "--json"],
+            {**environment, **server.environment, "XDG_RUNTIME_DIR": str(runtime)},
         )
         try:
             if measuring:
