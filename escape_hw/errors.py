@@ -99,3 +99,7 @@ class RequestRefused(EscapeError):
 
 class ClientUnknown(RequestRefused):
     """The client is not registered with the server, for example after a restart of the server."""
+
+
+class ServerFull(RequestRefused):
+    """The server has no free place for a client; open_loop, flatten and abort work all the same."""

@@ -1,10 +1,19 @@
 """Options of the whole suite."""
 
-from hardware_option import pytest_addoption, pytest_configure
+import campaign_table
+import hardware_option
+import pytest
+from campaign_table import pytest_terminal_summary
+from hardware_option import pytest_configure
 from hypothesis import HealthCheck, settings
 
-__all__ = ["pytest_addoption", "pytest_configure"]
+__all__ = ["pytest_addoption", "pytest_configure", "pytest_terminal_summary"]
 
 # How long an example takes says how busy the computer is, not whether the code is right.
 settings.register_profile("untimed", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("untimed")
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    hardware_option.pytest_addoption(parser)
+    campaign_table.pytest_addoption(parser)

@@ -165,7 +165,7 @@ def read_result(folder: Path | str) -> dict[str, Any]:
         document = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise ProductError(f"{path}: cannot be read ({error.strerror}); is this a run folder?") from error
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise ProductError(f"{path}: damaged; not a JSON document ({error})") from error
     if not isinstance(document, dict) or not isinstance(document.get("products"), dict):
         raise ProductError(f"{path}: it lists no products")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import logging
 import os
 import re
 import socket
@@ -19,7 +21,7 @@ import numpy as np
 
 from escape_hw.api.procedure import Progress
 from escape_hw.deprecation import renamed_members
-from escape_hw.errors import Aborted, CalibrationError, ClientUnknown, EscapeError, ServerGone
+from escape_hw.errors import Aborted, CalibrationError, ClientUnknown, EscapeError, ServerFull, ServerGone
 from escape_hw.remote import requests as ask
 from escape_hw.remote.address import Endpoint, resolve
 from escape_hw.remote.keys import client_keys, keys_hint
@@ -46,6 +48,8 @@ from escape_hw.runtime.procedures.python_method import procedure_method
 from escape_hw.runtime.procedures.registry import PROCEDURES
 from escape_hw.streams.ring import ReaderCache
 
+log = logging.getLogger(__name__)
+
 #: Silence of a server after which waiting for a run ends.
 _SERVER_TIMEOUT_S = 15.0
 
@@ -55,6 +59,7 @@ class RemoteRun:
 
     def __init__(self, connection: Connection, id: int, name: str) -> None:
         self._connection, self.id, self.name = connection, id, name
+        self._engine_pid = connection.state.engine_pid
 
     def __repr__(self) -> str:
         ended = self.ended
@@ -127,10 +132,16 @@ class RemoteRun:
     def _require_engine(self) -> None:
         """Raise when the engine has died, which ends its run without a further message."""
         state = self._connection.state
-        if state.active_run is not None or state.fault is None or state.engine_pid:
+        if state.engine_pid:
+            if self._engine_pid in (0, state.engine_pid):
+                return
+            reason = " / ".join(state.notes) or f"process {state.engine_pid} replaces it"
+        elif state.fault is not None:
+            reason = state.fault.reason
+        else:
             return
         if self._connection.wait_for(self.id, 0.0) is None:
-            raise CalibrationError(f"run {self.id} ({self.name}) ended with its engine: {state.fault.reason}")
+            raise CalibrationError(f"run {self.id} ({self.name}) ended with its engine: {reason}")
 
     def _result(self, ended: FinishedRun) -> Any:
         if ended.finish is Finish.FAILED:
@@ -166,6 +177,8 @@ TIMEOUT_S, SLOW_TIMEOUT_S = 3.0, 30.0
 #: Silence after which a server counts as disconnected; it publishes its state five times a second.
 _STALE_S = 2.0
 _LINES = 5000
+#: Longest wait for the reply to the last request, seconds.
+_GOODBYE_S = 1.0
 #: Longest wait for the state that belongs to a reply, seconds.
 _EVENT_S = 10.0
 
@@ -174,7 +187,8 @@ _EVENT_S = 10.0
 class Connection:
     """A connection to a server, see :func:`connect`; implements :class:`~escape_hw.remote.source.DataSource`.
 
-    It controls the server while it holds the lease.
+    It controls the server while it holds the lease. When the server has no free place, ``open_loop``,
+    ``flatten`` and ``abort`` work, and the other requests raise ``ServerFull`` until a place is free.
 
     Parameters
     ----------
@@ -203,7 +217,7 @@ class Connection:
     ) -> None:
         self.client = str(uuid.uuid4())
         self._name = name or _program()
-        self._closed = self._registered = False
+        self._closed = self._registered = self._waits_for_place = False
         self._changed = threading.Condition()
         self._state = State()
         self._log: deque[LogLine] = deque(maxlen=_LINES)
@@ -215,13 +229,17 @@ class Connection:
         self._link = ClientTransport(endpoint, self._event, self._heartbeat, keys=keys)
         try:
             self._register()
+        except ServerFull as error:
+            # The safety requests need no place; the heartbeat takes the next free one.
+            self._waits_for_place = True
+            log.warning("%s", error)
         except EscapeError:
             self.close()
             raise
 
     def _register(self) -> None:
         answer, _, _ = self._link.send_request(self._registration(), TIMEOUT_S)
-        self._registered = True
+        self._registered, self._waits_for_place = True, False
         with self._changed:
             self._state = State.model_validate(answer)
         lines, _ = self._request("log", count=1000)
@@ -239,15 +257,19 @@ class Connection:
 
     # ------------------------------------------------------------ life
     def close(self) -> None:
-        """Release the lease and close the connection; the server continues.
+        """Release the lease and the place at the server, and close the connection; the server continues.
 
         A running procedure needs another client in control.
         """
         if self._closed:
             return
-        if self.holds_lease and self.connected:
-            self.release()
-        self._closed = True
+        connected, self._closed = self.connected, True
+        if self._registered or self._waits_for_place:
+            # No further heartbeat, which would register this client again.
+            self._registered = self._waits_for_place = False
+            if connected:
+                with contextlib.suppress(EscapeError):
+                    self._link.send_request({"verb": "goodbye", "client": self.client}, _GOODBYE_S)
         self._link.close()
         self._readers.close()
 
@@ -266,6 +288,8 @@ class Connection:
         return self.state._repr_html_()
 
     def _heartbeat(self, refused: bool) -> Mapping[str, Any] | None:
+        if self._waits_for_place:
+            return self._registration()
         if not self._registered:
             return None
         # A client that was suspended for long is no longer registered.

@@ -42,6 +42,8 @@ class PlainRequest(Request):
         Keeps the client registered and its lease valid.
     ``release_lease``
         Release the lease.
+    ``goodbye``
+        Release the lease and the client's place; the client closes its connection.
     ``open_loop``, ``flatten``, ``abort_procedure``
         Open the loop, and abort a procedure that works in closed loop; abort all activity; stop the running
         procedure, whose data are saved. Answered when the mirror is flat.
@@ -54,7 +56,7 @@ class PlainRequest(Request):
     """
 
     verb: Literal[
-        "state", "geometry", "procedures", "heartbeat", "release_lease", "open_loop", "flatten",
+        "state", "geometry", "procedures", "heartbeat", "release_lease", "goodbye", "open_loop", "flatten",
         "abort_procedure", "pause_procedure", "resume_procedure", "clear_fault", "shutdown",
     ]  # fmt: skip
 
@@ -171,7 +173,7 @@ def build_request(verb: str, **fields: Any) -> AnyRequest:
         raise ConfigError(first_error(error)) from None
 
 
-#: Requests that are allowed to every client at any time.
+#: Requests that are allowed to every connection at any time, registered or not.
 SAFETY_VERBS = frozenset({"open_loop", "flatten", "abort_procedure"})
 #: Requests that need the lease.
 LEASE_VERBS = frozenset({

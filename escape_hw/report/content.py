@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, ValidationError
 
 from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.optical_gains import GainsResult
@@ -21,8 +22,27 @@ from escape_hw.io.fits.gains import KIND_GAINS, load_gains
 from escape_hw.io.fits.loop import KIND_PSF, load_loop
 from escape_hw.io.fits.matrix import KIND_MATRIX, load_matrix
 from escape_hw.io.fits.telemetry import KIND_TELEMETRY
-from escape_hw.io.run_folder import read_result
+from escape_hw.io.run_folder import RESULT_FILE, read_result
 from escape_hw.report.tables import METHOD_LABELS
+
+
+class _Criterion(BaseModel):
+    text: str
+    met: bool
+
+
+class _Document(BaseModel):
+    """Fields of ``result.json`` that every report reads; others are those of the command."""
+
+    model_config = ConfigDict(extra="allow")
+
+    command: str
+    system: str | None
+    simulated: bool | None
+    criteria: list[_Criterion] | None = None
+    injected: dict[str, float] | None = None
+    labels: dict[str, dict[str, str]] = {}
+    bench: dict[str, Any] = {}
 
 
 @dataclass(slots=True)
@@ -105,6 +125,7 @@ def read_run(folder: Path | str) -> RunContent:
         Not a run folder, or a product is missing or damaged.
     """
     document = read_result(folder)
+    _check_document(Path(folder) / RESULT_FILE, document)
     run = RunContent(Path(folder).absolute(), document)
     run.config_text, run.log_text = (
         _read_optional_text(run.folder / name) for name in ("config.toml", "run.log")
@@ -114,6 +135,19 @@ def read_run(folder: Path | str) -> RunContent:
         if path.suffix == ".fits":
             _add_product(run, name, path, labels.get(name, {}))
     return run
+
+
+def _check_document(path: Path, document: Mapping[str, Any]) -> None:
+    """Check the fields that every report reads (ProductError: one is missing, or of another kind)."""
+    try:
+        injected = _Document.model_validate(document).injected or {}
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(map(str, first["loc"]))
+        raise ProductError(f"{path}: damaged; '{where}': {first['msg']}") from error
+    unknown = set(injected) - {one.name for one in fields(Registration)}
+    if unknown:
+        raise ProductError(f"{path}: damaged; 'injected' has the unknown parameter {min(unknown)!r:.80}")
 
 
 def read_product(path: Path | str) -> RunContent:

@@ -102,7 +102,7 @@ def test_what_is_too_large_is_refused_or_cut_off(raw: zmq.Socket[bytes], bench: 
 
 
 def test_a_client_that_is_not_registered_is_refused(raw: zmq.Socket[bytes], bench: Connection) -> None:
-    request = {"verb": "open_loop", "client": bench.client}
+    request = {"verb": "acquire_lease", "client": bench.client}
     raw.send_multipart([b"1", json.dumps(request).encode()])
     assert "not registered under that client number" in answer(raw)["error"]["message"]
     hello = {

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import math
 import re
 from html.parser import HTMLParser
@@ -338,3 +339,19 @@ def test_picture_of_a_run(tmp_path):
 def test_sky_time_is_printed_in_words_too(page):
     assert "rms over 20 random registrations" in page
     assert "Fewest frames that meet every goal: whitened 500, unwhitened none of these." in page
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("command", None), ("system", 3), ("criteria", [{"text": "no end"}]), ("labels", {"escape": 1}),
+        ("injected", {"shift_z": 1.0}), ("injected", {"shift_x": "far"}), ("bench", []),
+    ],
+)  # fmt: skip
+def test_a_damaged_document_is_refused(tmp_path, key, value):
+    run = make_run(tmp_path / "run", lean=True)
+    file = run / "result.json"
+    document = json.loads(file.read_text())
+    file.write_text(json.dumps({**document, key: value}))
+    with pytest.raises(ProductError, match=key):
+        read_run(run)

@@ -41,7 +41,7 @@ def serve(
     """Open the devices of a system, and serve windows, scripts and notebooks until stopped."""
     from escape_hw.io.run_folder import default_runs_folder
     from escape_hw.io.storage import check_readable, check_writable, make_folder
-    from escape_hw.server.frontend.front_end import Server
+    from escape_hw.server.frontend.supervisor import FrontEndSupervisor
 
     if port is None and bind != _LOOPBACK:
         raise ConfigError(f"--bind {bind} needs --port; without it the server has local sockets only")
@@ -52,11 +52,12 @@ def serve(
     check_writable(runs)
     for folder in read_folders:
         check_readable(folder)
-    with context.interrupts.protect_closing(Server(config, bind, port)) as server:
+    supervisor = FrontEndSupervisor(config, bind, port, runs, read_folders)
+    with context.interrupts.protect_closing(supervisor) as server:
         _print_listing(context, config, server.listing)
         with context.interrupts.procedure() as stop:
             context.devices_opened = True
-            server.run(stop, runs, read_folders)
+            server.run(stop)
     context.notify("serve: stopped, mirror flat")
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 import time
 from collections.abc import Callable
 from typing import Any
@@ -35,7 +34,7 @@ class PublishedState:
         before = self.state
         self.state = (before if state is None else state).model_copy(
             update={
-                "serial": before.serial + 1, "server_pid": os.getpid(), "lease": self._leases.lease,
+                "serial": before.serial + 1, "server_pid": before.server_pid, "lease": self._leases.lease,
                 "clients": self._leases.count, "refused_requests": self._transport.refused,
                 "notes": before.notes,
             }
@@ -155,8 +154,8 @@ class EngineSupervisor:
             return
         self._on_message(message)
         if "run" in message:
-            self._setup = self._setup.model_copy(update={"first_run_id": message["run"]["id"] + 1})
             self._journal.write(message["run"])
+            self._setup = self._setup.model_copy(update={"first_run_id": self._journal.last_run_id + 1})
         elif "ended" in message:
             self._journal.write(None)
 
@@ -187,7 +186,7 @@ class EngineSupervisor:
             self._kill(engine, f"the engine was silent for {silence:.1f} s (limit {limit:g} s)")
         elif self._stop_requested_s is not None and now - self._stop_requested_s > STOP_TIMEOUT_S:
             self._kill(engine, f"the engine did not end within {STOP_TIMEOUT_S:g} s")
-        elif state.mirror.peak > 0 and oldest_safety_request_s > _SAFETY_TIMEOUT_S:
+        elif is_current and state.mirror.peak > 0 and oldest_safety_request_s > _SAFETY_TIMEOUT_S:
             self._kill(engine, f"the engine did not make the mirror flat within {_SAFETY_TIMEOUT_S:g} s")
 
     def _kill(self, engine: EngineProcess, reason: str) -> None:

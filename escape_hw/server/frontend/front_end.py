@@ -4,30 +4,21 @@ from __future__ import annotations
 
 import itertools
 import logging
-import os
 import time
-from contextlib import ExitStack
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import zmq
 from zmq.auth.thread import ThreadAuthenticator
 
 from escape_hw.api.procedure import StopSignal
 from escape_hw.config.system import SystemConfig
-from escape_hw.errors import ConfigError, EscapeError, RequestRefused
+from escape_hw.errors import EscapeError, RequestRefused
 from escape_hw.io.provenance import format_utc, get_software_version
 from escape_hw.remote import requests
-from escape_hw.remote.address import (
-    Endpoint,
-    ServerListing,
-    find_server,
-    is_loopback,
-    local_endpoint,
-    register_server,
-    tcp_endpoint,
-    unregister_server,
-)
+from escape_hw.remote.address import Endpoint, is_loopback, tcp_endpoint
 from escape_hw.remote.keys import allowed_keys, server_keys
 from escape_hw.remote.source import RENAMED_STREAMS, STREAMS
 from escape_hw.remote.state import SCHEMA, FinishedRun, LogLine, Phase, State
@@ -38,27 +29,41 @@ from escape_hw.server.ipc.channel import EngineSetup
 from escape_hw.server.ipc.log import ServerLog
 from escape_hw.server.safety.journal import ServerJournal
 from escape_hw.streams.ring import ReaderCache
-from escape_hw.supervision import process_start
 
 log = logging.getLogger(__name__)
 
-_POLL_MS = 50
+#: Period of the main loop, and while replies wait for slow clients.
+_POLL_MS, _BUSY_POLL_MS = 50, 5
+#: Requests of one connection that may wait for the engine; further ones are refused.
+_MAX_PENDING = 20
 
 
 class FrontEnd:
-    """Serves the clients of one system and supervises its engine."""
+    """Serves the clients of one system and supervises its engine.
+
+    ``server_pid`` is the process of the server. Log lines and states are numbered from ``first_number``.
+    """
 
     def __init__(
-        self, config: SystemConfig, transport: ZmqTransport, runs: Path, read_folders: tuple[Path, ...] = ()
+        self,
+        config: SystemConfig,
+        transport: ZmqTransport,
+        runs: Path,
+        read_folders: tuple[Path, ...],
+        server_pid: int,
+        first_number: int = 0,
     ) -> None:
         self._config, self._transport = config, transport
         self._journal = ServerJournal(config.system.name)
         self._log = ServerLog(
-            self._journal.folder / f"{config.system.name}.log", lambda line: transport.publish("log", line)
+            self._journal.folder / f"{config.system.name}.log",
+            lambda line: transport.publish("log", line),
+            first_number,
         )
         self._leases = LeaseManager(config.server.lease_s)
+        transport.on_disconnect = self._leases.remove_connection
         state = State(
-            at_utc=format_utc(), server_pid=os.getpid(), version=get_software_version(),
+            serial=first_number, at_utc=format_utc(), server_pid=server_pid, version=get_software_version(),
             system=config.system.name, simulated=config.simulated, seed=config.system.seed,
             notes=self._journal.read_previous_end(),
         )  # fmt: skip
@@ -68,7 +73,10 @@ class FrontEnd:
         self._numbers = itertools.count(1)
         self._readers = ReaderCache()
         self._journal.write(None)
-        setup = EngineSetup(config_text=config.to_toml(), runs=runs, read_folders=read_folders)
+        setup = EngineSetup(
+            config_text=config.to_toml(), runs=runs, read_folders=read_folders,
+            first_run_id=self._journal.last_run_id + 1,
+        )  # fmt: skip
         self._supervisor = EngineSupervisor(
             config.server, setup, self._journal, self._published,
             on_message=self._on_engine_message, on_exit=self._refuse_pending,
@@ -86,7 +94,7 @@ class FrontEnd:
                 engine = supervisor.running_engine
                 if engine is not None:
                     poller.register(engine.connection.fileno(), zmq.POLLIN)
-                poller.poll(_POLL_MS)
+                poller.poll(_BUSY_POLL_MS if self._transport.flush() else _POLL_MS)
                 if engine is not None:
                     poller.unregister(engine.connection.fileno())
                     supervisor.receive_messages(engine)
@@ -161,11 +169,12 @@ class FrontEnd:
             if isinstance(request, requests.RegisterClient):
                 self._transport.send_reply(route, self._register(request, route.sender))
                 return
+            if request.verb in requests.SAFETY_VERBS:
+                self._forward_safety_request(incoming)
+                return
             client = self._leases.record_activity(request.client, route.sender)
             if request.verb in requests.LEASE_VERBS:
                 self._leases.require(client)
-            if request.verb in requests.SAFETY_VERBS:
-                log.warning("%s: %s", client.description, request.verb.replace("_", " "))
             match request:
                 case requests.GetLatestSample():
                     self._transport.send_reply(route, *self._latest(request))
@@ -178,6 +187,10 @@ class FrontEnd:
                     self._transport.send_reply(route, lease)
                 case requests.PlainRequest(verb="release_lease"):
                     self._leases.release(client)
+                    self._published.update()
+                    self._transport.send_reply(route, None)
+                case requests.PlainRequest(verb="goodbye"):
+                    self._leases.remove(client)
                     self._published.update()
                     self._transport.send_reply(route, None)
                 case requests.PlainRequest(verb="state"):
@@ -217,6 +230,13 @@ class FrontEnd:
         }  # fmt: skip
         return head, sample.data.tobytes()
 
+    def _forward_safety_request(self, incoming: IncomingRequest) -> None:
+        """Forward a safety request, from any connection: it needs neither registration nor control."""
+        verb, route = incoming.request.verb, incoming.route
+        sender = self._leases.describe_sender(incoming.request.client, route.sender)
+        log.warning("%s: %s", sender, verb.replace("_", " "))
+        self._forward(incoming)
+
     def _forward(self, incoming: IncomingRequest) -> None:
         """Forward a request to the engine."""
         engine = self._supervisor.running_engine
@@ -225,6 +245,9 @@ class FrontEnd:
             return
         if incoming.request.verb == "shutdown":
             self._supervisor.note_stop_request()
+        sender = incoming.route.sender
+        if sum(one.route.sender == sender for one, _ in self._pending.values()) >= _MAX_PENDING:
+            raise RequestRefused(f"{_MAX_PENDING} requests of this connection wait already; wait for replies")
         number = next(self._numbers)
         self._pending[number] = (incoming, time.monotonic())
         engine.send({"id": number, "request": incoming.request.model_dump(mode="json")})
@@ -260,56 +283,27 @@ class ClientKeyCheck:
         return bool(names)
 
 
-class Server:
-    """A listening server with its sockets and its entry in the user's list; a context manager.
+@contextmanager
+def listening_transport(local: Endpoint, host: str, port: int | None) -> Iterator[ZmqTransport]:
+    """A transport that listens on local sockets and, with a ``port``, on TCP as well.
 
-    It listens on local sockets and, with a ``port``, on TCP as well. ConfigError: the system is served
-    already, or the address is not available.
+    ConfigError: an address is not available.
     """
-
-    def __init__(self, config: SystemConfig, host: str = "127.0.0.1", port: int | None = None) -> None:
-        self._config, self._stack = config, ExitStack()
-        name, pid = config.system.name, os.getpid()
-        running = find_server(name)
-        if running is not None and running.alive:
-            raise ConfigError(f"'{name}' is already served by process {running.pid}; stop that server first")
-        if running is not None:
-            unregister_server(running)
-        local = local_endpoint(name, pid)
-        tcp = "" if port is None else tcp_endpoint(host, port).requests
-        self.listing = ServerListing(name, pid, process_start(pid) or 0, local.requests, local.events, tcp)
+    with ExitStack() as stack:
         context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-        self._stack.callback(context.term)
-        self._transport = ZmqTransport(context)
-        try:
-            self._stack.callback(unregister_server, self.listing)
-            self._stack.callback(self._transport.close)
-            self._open(context, local, None if port is None else tcp_endpoint(host, port), host)
-        except BaseException:
-            self._stack.close()
-            raise
-
-    def _open(
-        self, context: zmq.Context[zmq.Socket[bytes]], local: Endpoint, tcp: Endpoint | None, host: str
-    ) -> None:
-        if tcp is None or is_loopback(host):
-            self._transport.open(*(one for one in (local, tcp) if one is not None))
-            return
-        keys = server_keys()
-        authenticator = ThreadAuthenticator(context)
-        authenticator.start()
-        self._stack.callback(authenticator.stop)
-        authenticator.configure_curve_callback("escape", ClientKeyCheck())
-        self._transport.open(local)
-        self._transport.open(tcp, keys=keys)
-
-    def run(self, stop: StopSignal, runs: Path, read_folders: tuple[Path, ...] = ()) -> None:
-        """Serve until ``stop`` is set; parameters as for :class:`FrontEnd`."""
-        register_server(self.listing)
-        FrontEnd(self._config, self._transport, runs, read_folders).run(stop)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._stack.close()
+        stack.callback(context.term)
+        transport = ZmqTransport(context)
+        stack.callback(transport.close)
+        if port is None:
+            transport.open(local)
+        elif is_loopback(host):
+            transport.open(local, tcp_endpoint(host, port))
+        else:
+            keys = server_keys()
+            authenticator = ThreadAuthenticator(context)
+            authenticator.start()
+            stack.callback(authenticator.stop)
+            authenticator.configure_curve_callback("escape", ClientKeyCheck())
+            transport.open(local)
+            transport.open(tcp_endpoint(host, port), keys=keys)
+        yield transport

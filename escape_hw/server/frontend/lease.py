@@ -7,15 +7,15 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from escape_hw.errors import ClientUnknown, LeaseHeld, RequestRefused
+from escape_hw.errors import ClientUnknown, LeaseHeld, RequestRefused, ServerFull
 from escape_hw.io.provenance import format_utc
 from escape_hw.remote.requests import RegisterClient
 from escape_hw.remote.state import Lease
 
 log = logging.getLogger(__name__)
 
-#: Silence after which a client is no longer registered.
-_CLIENT_TIMEOUT_S = 60.0
+#: Silence after which a client is no longer registered: several of its heartbeats, which are due every 2 s.
+CLIENT_TIMEOUT_S = 10.0
 #: Largest number of registered clients.
 MAX_CLIENTS = 200
 
@@ -66,18 +66,39 @@ class LeaseManager:
     def register_client(self, registration: RegisterClient, route: bytes) -> None:
         """Register a client, also again after its connection was interrupted.
 
-        RequestRefused when there are too many, or another connection uses this client number.
+        ServerFull when there are too many, RequestRefused when another connection uses this client number.
         """
+        self.expire()
         known = self._clients.get(registration.client)
         if known is not None and known.route != route:
             raise RequestRefused("this client number belongs to another connection; choose another one")
         if known is None and len(self._clients) >= MAX_CLIENTS:
-            raise RequestRefused(f"{MAX_CLIENTS} clients are registered already, which is the limit")
+            raise ServerFull(
+                f"{MAX_CLIENTS} clients are registered already, which is the limit; open_loop, flatten and "
+                "abort_procedure work without registration"
+            )
         if known is None:
             client = self._clients[registration.client] = RegisteredClient(registration, route, self._clock())
             log.info("client %d: %s", len(self._clients), client.description)
         else:
             known.last_message_s = self._clock()
+
+    def remove(self, client: RegisteredClient) -> None:
+        """Remove a client that leaves, with its lease."""
+        self.release(client)
+        self._clients.pop(client.registration.client, None)
+
+    def remove_connection(self, route: bytes) -> None:
+        """Remove all clients of a connection that was closed."""
+        for client in [one for one in self._clients.values() if one.route == route]:
+            self.remove(client)
+
+    def describe_sender(self, client: str, route: bytes) -> str:
+        """Sender of a safety request, which need not be registered."""
+        try:
+            return self.record_activity(client, route).description
+        except ClientUnknown:
+            return "a client that is not registered"
 
     def record_activity(self, client: str, route: bytes) -> RegisteredClient:
         """Note a message of a client and return the client (ClientUnknown: not registered)."""
@@ -127,9 +148,8 @@ class LeaseManager:
                 holder.description, now - holder.last_message_s, self.expiry_s,
             )  # fmt: skip
             self._holder, self.released_s = None, now
-        for number in [
-            key for key, one in self._clients.items() if now - one.last_message_s > _CLIENT_TIMEOUT_S
-        ]:
+        timeout_s = max(CLIENT_TIMEOUT_S, self.expiry_s)
+        for number in [key for key, one in self._clients.items() if now - one.last_message_s > timeout_s]:
             del self._clients[number]
 
     def seconds_without_holder(self) -> float:

@@ -51,10 +51,10 @@ def forward_log(forward: Callable[[LogLine], object]) -> LogForwarder:
 class ServerLog:
     """Numbers, stores and publishes the lines of front end and engine."""
 
-    def __init__(self, path: Path, publish: Callable[[LogLine], object]) -> None:
+    def __init__(self, path: Path, publish: Callable[[LogLine], object], first_number: int = 0) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         self._lines: deque[LogLine] = deque(maxlen=_LINES)
-        self._next, self._publish = 0, publish
+        self._next, self._publish = first_number, publish
         self._file = logging.handlers.RotatingFileHandler(
             path, maxBytes=_BYTES, backupCount=_FILES, encoding="utf-8"
         )

@@ -27,16 +27,27 @@ def server_folder() -> Path:
 
 
 class ServerJournal:
-    """Journal of a system's server; its file exists while the server runs."""
+    """Journal of a system's server; its file exists while the server runs.
+
+    Attributes
+    ----------
+    last_run_id
+        Number of the last run, also of a server that did not end cleanly.
+    """
 
     def __init__(self, system: str) -> None:
         self.system, self.folder = system, server_folder()
         self._path = self.folder / f"{system}.journal.json"
+        self.last_run_id = 0
 
     def write(self, run: dict[str, Any] | None) -> None:
         """Write the active run with its folder, or ``None``."""
         pid = os.getpid()
-        content = {"pid": pid, "started": process_start(pid), "run": run}
+        if run is not None:
+            self.last_run_id = int(run["id"])
+        content = {
+            "pid": pid, "started": process_start(pid), "run": run, "last_run_id": self.last_run_id,
+        }  # fmt: skip
         write_atomic(self._path, json.dumps(content).encode())
 
     def close(self) -> None:
@@ -50,6 +61,7 @@ class ServerJournal:
         """
         notes = []
         if (stale := self._stale_journal()) is not None:
+            self.last_run_id = int(stale.get("last_run_id", 0))
             notes.append(f"the previous server (process {stale.get('pid')}) did not end cleanly")
             if (run := stale.get("run")) is not None:
                 notes.append(_describe_run(run))

@@ -75,15 +75,14 @@ class RecorderProcess:
 
 
 def main() -> None:
-    """Record what the command line specifies until standard input ends."""
+    """Record what the command line says until standard input ends."""
     os.nice(_NICE)
     request = json.loads(sys.argv[1])
     stop = watch_standard_input()
 
     def print_state(state: RecordingProgress) -> None:
         try:
-            # Not through sys.stdout, whose buffer is flushed at exit: that fails again when the reader is
-            # gone.
+            # Not through sys.stdout: its buffer is flushed at exit, which fails when the reader is gone.
             os.write(1, json.dumps(asdict(state)).encode() + b"\n")
         except BrokenPipeError:
             stop.set()

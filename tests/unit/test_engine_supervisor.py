@@ -1,0 +1,48 @@
+"""Limits of the engine's silence, with an engine that never sends a message."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from escape_hw.config.loader import load_system
+from escape_hw.remote.state import State
+from escape_hw.server.frontend import engine_supervisor
+from escape_hw.server.frontend.engine_supervisor import EngineSupervisor
+
+PID, NOW_S = 4711, 1000.0
+
+
+class SilentEngine:
+    """An engine whose last message came 20 s ago."""
+
+    last_message_s = NOW_S - 20
+
+    def __init__(self, *_: object) -> None:
+        self.killed = False
+        self.process = SimpleNamespace(pid=PID, running=True, kill=lambda: setattr(self, "killed", True))
+        self.failsafe = SimpleNamespace(running=True)
+
+    def send(self, message: Any) -> None:
+        pass
+
+    flush = maintain_failsafe = lambda self, *_: None
+
+
+@pytest.mark.parametrize(
+    ("engine_pid", "peak", "killed"), [(PID, 0.1, True), (PID, 0.0, False), (0, 0.1, False)],
+    ids=["moving", "flat", "the mirror of the engine before"],
+)  # fmt: skip
+def test_a_silent_engine(monkeypatch: pytest.MonkeyPatch, engine_pid: int, peak: float, killed: bool) -> None:
+    monkeypatch.setattr(engine_supervisor, "EngineProcess", SilentEngine)
+    monkeypatch.setattr(engine_supervisor, "time", SimpleNamespace(monotonic=lambda: NOW_S))
+    state = State(engine_pid=engine_pid)
+    state = state.model_copy(update={"mirror": state.mirror.model_copy(update={"peak": peak})})
+    supervisor = EngineSupervisor(
+        load_system("razor-shwfs").server, None, SimpleNamespace(folder="", system="razor-shwfs"),
+        SimpleNamespace(state=state), on_message=print, on_exit=print,
+    )  # fmt: skip
+    supervisor.check(0.0)
+    assert supervisor.running_engine.killed is killed
