@@ -8,8 +8,8 @@ from pydantic import Field, model_validator
 
 from escape_hw.api.camera import CameraSettings, Region
 from escape_hw.api.mirror import DMInfo
-from escape_hw.config import actuator_layouts
-from escape_hw.config.section import RuleViolation, Section, TomlArray, raise_violations
+from escape_hw.config import layouts
+from escape_hw.config.section import LayoutText, RuleViolation, Section, TomlArray, raise_violations
 from escape_hw.safety.limits import MirrorLimits
 
 if TYPE_CHECKING:
@@ -172,10 +172,11 @@ class LimitsConfig(Section):
 class MirrorConfig(DeviceConfig):
     """Deformable mirror: nominal geometry and limits."""
 
-    layout: str = Field(
-        pattern=actuator_layouts.PATTERN,
-        description="arrangement of the actuators: 'circle-N' or 'square-N' on an N x N grid, "
-        "'rings-336' or 'rings-672' on rings",
+    layout: LayoutText = Field(
+        description=f"arrangement of the actuators: {layouts.FORMS}",
+    )
+    position_unit: Literal["pitch", "metre", "pupil-radius"] = Field(
+        "pitch", description="unit of the positions in a layout 'positions:FILE', on the mirror"
     )
     pitch_m: float = Field(gt=0, le=1, description="distance between actuators on the mirror, metres")
     pitches_across_pupil: float = Field(
@@ -190,17 +191,16 @@ class MirrorConfig(DeviceConfig):
     @property
     def n_act(self) -> int:
         """Number of actuators."""
-        return actuator_layouts.n_actuators(self.layout)
+        return layouts.n_actuators(self.layout)
 
     def actuator_map(self) -> NDArray[np.bool_] | None:
-        """Boolean map ``(N, N)``, true where there is an actuator; ``None`` without a grid."""
-        return (
-            actuator_layouts.actuator_map(self.layout) if actuator_layouts.is_on_grid(self.layout) else None
-        )
+        """Boolean map of the grid, true where there is an actuator; ``None`` without a grid."""
+        return layouts.layout_map(self.layout) if layouts.is_on_grid(self.layout) else None
 
     def positions(self) -> NDArray[np.float64]:
         """Actuator positions ``(n_act, 2)`` as (x, y) from the mirror's centre, in pitches."""
-        return actuator_layouts.positions(self.layout)
+        in_pitches = {"pitch": 1.0, "metre": 1 / self.pitch_m, "pupil-radius": self.pitches_across_pupil / 2}
+        return layouts.positions(self.layout) * in_pitches[self.position_unit]
 
     def info(self, model: str, *, simulated: bool, serial: str = "") -> DMInfo:
         """Identity and nominal geometry for a driver or twin; ``serial`` is by default as configured."""
@@ -225,6 +225,9 @@ class MirrorConfig(DeviceConfig):
         if len(set(self.limits.disabled)) == self.n_act and not bad:
             text = "disables every actuator; leave at least one in service"
             violations.append(RuleViolation("limits.disabled", list(self.limits.disabled), text))
+        if self.position_unit != "pitch" and not self.layout.startswith("points:"):
+            text = "is the unit of a layout 'positions:FILE'; other layouts are in pitches; remove it"
+            violations.append(RuleViolation("position_unit", self.position_unit, text))
         raise_violations(violations)
         return self
 

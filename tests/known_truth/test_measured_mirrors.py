@@ -5,17 +5,14 @@ Its influence functions are rounded exponentials and its slopes have no tip and 
 
 from __future__ import annotations
 
-import os
-from pathlib import Path
-
 import numpy as np
 import pytest
+from shared_data import SHARED
 
 from escape_benchmarks.measured.dm97 import fit_matrix, read_matrix
 from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.calibration.sprint.fit import SprintFit
 
-SHARED = Path(os.environ.get("ESCAPE_SHARED_DATA", Path(__file__).parents[3] / "shared" / "data"))
 FOLDER = SHARED / "dm97"
 #: One date for each of the three masks.
 DATES = ("20230901150923", "20231214151118", "20231219151519")

@@ -16,6 +16,7 @@ from pydantic import Field
 from escape_drivers.alpao.library import AlpaoLibrary, format_version
 from escape_drivers.common.options import parse_options, require_serial
 from escape_hw.api.mirror import DeformableMirror, DMInfo
+from escape_hw.config.layouts import shorten
 from escape_hw.config.section import Section
 from escape_hw.errors import CommandRejected, DeviceError
 
@@ -153,8 +154,8 @@ class AlpaoMirror(DeformableMirror):
         if n_act != self._section.n_act:
             raise DeviceError(
                 self.name,
-                f"has {n_act} actuators, but the layout {self._section.layout!r} has {self._section.n_act}; "
-                "correct devices.dm.layout or the serial number",
+                f"has {n_act} actuators, but the layout {shorten(self._section.layout)!r} has "
+                f"{self._section.n_act}; correct devices.dm.layout or the serial number",
             )
         version = format_version(library.get(handle, "VersionInfo"))
         log.info("%s: SDK %s, mirror %s", self.name, version, self._section.serial)
