@@ -109,7 +109,8 @@ def reproduce_all(
     context: CommandContext,
     out: Annotated[Path, typer.Option("--out", help="Folder with one folder for each part.")],
     only: Annotated[
-        list[str] | None, typer.Option("--only", help="A part (table1, shwfs, pywfs, maps, revolt); repeatable.")
+        list[str] | None,
+        typer.Option("--only", help="A part (table1, shwfs, pywfs, maps, revolt); repeatable."),
     ] = None,
     share: Annotated[
         float,
