@@ -213,7 +213,7 @@ def test_what_does_not_fit_is_refused(folder, tables, error, text):
 def test_a_mask_must_fit_the_system(folder):
     write(folder / "im.npy", DATA)
     target = ArrayTarget("bench", False, 5, 21, CIRCLE, 10.0, (64, 64))
-    with pytest.raises(IncompatibleProduct, match="4 x 4 sub-apertures .* sensor.n_sub = 5; correct"):
+    with pytest.raises(IncompatibleProduct, match=r"4 x 4 sub-apertures .* sensor\.n_sub = 5; correct"):
         import_arrays(describe(matrix={"file": "im.npy"}), folder, target)
 
 
@@ -230,7 +230,7 @@ def test_a_wrong_description_names_its_keys(tmp_path):
         "sensor.flip_x: input should be a valid boolean, not 1",
     ):
         assert key in text
-    with pytest.raises(ConfigError, match="cannot be read .No such file"):
+    with pytest.raises(ConfigError, match=r"cannot be read .No such file"):
         read_description(tmp_path / "none.toml")
 
 
