@@ -343,8 +343,8 @@ def _read_mask(path: Path) -> NDArray[np.bool_]:
             first, second = np.split(mask, 2, axis=axis)
             if not np.array_equal(first, second):
                 raise IncompatibleProduct(f"{path}: the masks for x and y differ; give one for both")
-            return first
-    return mask
+            mask = first
+    return np.asarray(mask)
 
 
 def _turn_camera(
