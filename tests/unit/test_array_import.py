@@ -210,10 +210,21 @@ def test_what_does_not_fit_is_refused(folder, tables, error, text):
         import_arrays(describe(**{"matrix": {"file": "im.npy"}, **tables}), folder, TARGET)
 
 
+def test_a_larger_mask_is_cut_where_nothing_is_valid(folder):
+    np.savetxt(folder / "wide.txt", np.pad(MASK, 3), fmt="%d")
+    write(folder / "im.npy", DATA)
+    description = describe(matrix={"file": "im.npy"}, sensor={"valid": "wide.txt"})
+    found = import_arrays(description, folder, TARGET)
+    assert np.array_equal(found.grid.valid, np.pad(MASK, 1))
+    assert found.matrix.data == pytest.approx(DATA, rel=1e-6)
+    with pytest.raises(IncompatibleProduct, match="10 x 10 sub-apertures cannot be centred"):
+        import_arrays(description, folder, replace(TARGET, n_sub=2))
+
+
 def test_a_mask_must_fit_the_system(folder):
     write(folder / "im.npy", DATA)
     target = ArrayTarget("bench", False, 5, 21, CIRCLE, 10.0, (64, 64))
-    with pytest.raises(IncompatibleProduct, match=r"4 x 4 sub-apertures .* sensor\.n_sub = 5; correct"):
+    with pytest.raises(IncompatibleProduct, match=r"4 x 4 sub-apertures cannot .* sensor\.n_sub = 5; correct"):
         import_arrays(describe(matrix={"file": "im.npy"}), folder, target)
 
 

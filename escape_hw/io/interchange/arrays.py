@@ -77,7 +77,8 @@ class SensorTable(_Table):
     valid
         Mask of the valid sub-apertures in the file's orientation: the name of a file, or ``"nonzero"`` for
         maps (those with any response). A mask of two maps, beside or above each other, may be given for x
-        and y. A smaller mask than the system's ``n_sub`` is centred on it.
+        and y. A mask smaller than the system's ``n_sub`` is centred on it; a larger one is cut where it has
+        no valid sub-apertures.
     transpose, flip_x, flip_y
         What makes the camera's image that of the system: rows and columns exchanged, then mirrored along x
         (columns) and y (rows). Slopes are exchanged and change their signs with it.
@@ -368,11 +369,16 @@ def _turn(image: NDArray[Any], transpose: bool, flip_x: bool, flip_y: bool) -> N
 
 
 def _centre_mask(valid: NDArray[np.bool_], n_sub: int) -> NDArray[np.bool_]:
+    """The mask on ``n_sub x n_sub``; a larger one is cut where it has no valid sub-apertures."""
     missing = n_sub - np.array(valid.shape)
-    if (missing < 0).any() or (missing % 2).any():
+    cut = [slice(-int(m) // 2, int(m) // 2) if m < 0 else slice(None) for m in missing]
+    shape = valid.shape
+    valid, all_valid = valid[tuple(cut)], int(valid.sum())
+    missing = np.maximum(missing, 0)
+    if int(valid.sum()) < all_valid or ((n_sub - np.array(valid.shape)) % 2).any():
         raise IncompatibleProduct(
-            f"the mask has {valid.shape[0]} x {valid.shape[1]} sub-apertures and cannot be centred on "
-            f"sensor.n_sub = {n_sub}; correct sensor.n_sub of the system (--set sensor.n_sub=N)"
+            f"the mask of {shape[0]} x {shape[1]} sub-apertures cannot be centred on sensor.n_sub = {n_sub}; "
+            "correct sensor.n_sub of the system (--set sensor.n_sub=N)"
         )
     return np.pad(valid, [(int(m) // 2, int(m) // 2) for m in missing])
 
