@@ -8,7 +8,7 @@ import logging
 import numpy as np
 
 import escape_hw
-from escape_hw.config.actuator_layouts import actuator_map
+from escape_hw.config.layouts import layout_map
 from escape_hw.safety.limits import CAUTIOUS_LIMITS
 
 logging.getLogger("escape_hw").setLevel(logging.ERROR)  # the checks provoke failures
@@ -32,7 +32,7 @@ class AcmeMirror(escape_hw.DeformableMirror):
         self, serial: str, *, name: str = "acme", limits: escape_hw.MirrorLimits = CAUTIOUS_LIMITS
     ) -> None:
         super().__init__(name, limits)
-        self._serial, self._layout = serial, actuator_map("circle-11")
+        self._serial, self._layout = serial, layout_map("circle-11")
         self._electronics: AcmeElectronics | None = None
 
     @classmethod

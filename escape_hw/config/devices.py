@@ -8,8 +8,8 @@ from pydantic import Field, model_validator
 
 from escape_hw.api.camera import CameraSettings, Region
 from escape_hw.api.mirror import DMInfo
-from escape_hw.config import actuator_layouts
-from escape_hw.config.section import RuleViolation, Section, TomlArray, raise_violations
+from escape_hw.config import layouts
+from escape_hw.config.section import LayoutText, RuleViolation, Section, TomlArray, raise_violations
 from escape_hw.safety.limits import MirrorLimits
 
 if TYPE_CHECKING:
@@ -182,9 +182,9 @@ def mirror_info(
     return DMInfo(
         model,
         serial,
-        actuator_layouts.n_actuators(layout),
-        actuator_layouts.actuator_map(layout) if actuator_layouts.is_on_grid(layout) else None,
-        actuator_layouts.positions(layout) * pitch_m,
+        layouts.n_actuators(layout),
+        layouts.layout_map(layout) if layouts.is_on_grid(layout) else None,
+        layouts.positions(layout) * pitch_m,
         stroke_m,
         simulated,
     )
@@ -193,10 +193,11 @@ def mirror_info(
 class MirrorConfig(DeviceConfig):
     """Deformable mirror: nominal geometry and limits."""
 
-    layout: str = Field(
-        pattern=actuator_layouts.PATTERN,
-        description="arrangement of the actuators: 'circle-N' or 'square-N' on an N x N grid, "
-        "'rings-336' or 'rings-672' on rings",
+    layout: LayoutText = Field(
+        description=f"arrangement of the actuators: {layouts.FORMS}",
+    )
+    position_unit: Literal["pitch", "metre", "pupil-radius"] = Field(
+        "pitch", description="unit of the positions in a layout 'positions:FILE', on the mirror"
     )
     pitch_m: float = Field(gt=0, le=1, description="distance between actuators on the mirror, metres")
     pitches_across_pupil: float = Field(
@@ -211,22 +212,32 @@ class MirrorConfig(DeviceConfig):
     @property
     def n_act(self) -> int:
         """Number of actuators."""
-        return actuator_layouts.n_actuators(self.layout)
+        return layouts.n_actuators(self.layout)
 
     def actuator_map(self) -> NDArray[np.bool_] | None:
-        """Boolean map ``(N, N)``, true where there is an actuator; ``None`` without a grid."""
-        return (
-            actuator_layouts.actuator_map(self.layout) if actuator_layouts.is_on_grid(self.layout) else None
-        )
+        """Boolean map of the grid, true where there is an actuator; ``None`` without a grid."""
+        return layouts.layout_map(self.layout) if layouts.is_on_grid(self.layout) else None
 
     def positions(self) -> NDArray[np.float64]:
         """Actuator positions ``(n_act, 2)`` as (x, y) from the mirror's centre, in pitches."""
-        return actuator_layouts.positions(self.layout)
+        in_pitches = {"pitch": 1.0, "metre": 1 / self.pitch_m, "pupil-radius": self.pitches_across_pupil / 2}
+        return layouts.positions(self.layout) * in_pitches[self.position_unit]
+
+    def layout_in_pitches(self) -> str:
+        """The layout; a table of positions in pitches, whatever its unit."""
+        if self.position_unit == "pitch":
+            return self.layout
+        return "points:" + ";".join(f"{x:.9g},{y:.9g}" for x, y in self.positions().tolist())
 
     def info(self, model: str, *, simulated: bool, serial: str = "") -> DMInfo:
         """Identity and nominal geometry for a driver or twin; ``serial`` is by default as configured."""
         return mirror_info(
-            self.layout, self.pitch_m, self.stroke_m, model, serial or self.serial, simulated=simulated
+            self.layout_in_pitches(),
+            self.pitch_m,
+            self.stroke_m,
+            model,
+            serial or self.serial,
+            simulated=simulated,
         )
 
     @model_validator(mode="after")
@@ -239,6 +250,9 @@ class MirrorConfig(DeviceConfig):
         if len(set(self.limits.disabled)) == self.n_act and not bad:
             text = "disables every actuator; leave at least one in service"
             violations.append(RuleViolation("limits.disabled", list(self.limits.disabled), text))
+        if self.position_unit != "pitch" and not self.layout.startswith("points:"):
+            text = "is the unit of a layout 'positions:FILE'; other layouts are in pitches; remove it"
+            violations.append(RuleViolation("position_unit", self.position_unit, text))
         raise_violations(violations)
         return self
 

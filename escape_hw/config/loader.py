@@ -117,6 +117,8 @@ def _translate(detail: ErrorDetails) -> list[ConfigProblem]:
         return [ConfigProblem(path, value, _wrong_choice(detail))]
     if kind == "string_pattern_mismatch":
         return [ConfigProblem(path, value, f"is not allowed; expected: {field.description}")]
+    if kind == "layout":
+        return [ConfigProblem(path, value, _message(detail))]
     hint = f" ({'; '.join(hints)})" if hints else ""
     return [ConfigProblem(existing, value, _message(detail) + hint)]
 
@@ -143,7 +145,7 @@ def _hint(suggestion: str | None) -> str:
 
 
 #: Text accepted without quotes, which a shell removes: words, paths, network addresses.
-_BARE_WORD = re.compile(r"^(?:[A-Za-z_/~.][\w./~ :+-]*|\d{1,3}(?:\.\d{1,3}){3})$")
+_BARE_WORD = re.compile(r"^(?:[A-Za-z_/~.][\w./~ :,+-]*|\d{1,3}(?:\.\d{1,3}){3})$")
 
 
 @dataclass(frozen=True, slots=True)

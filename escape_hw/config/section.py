@@ -5,8 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Annotated, Any, NamedTuple, TypeVar
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict
 from pydantic_core import PydanticCustomError
+
+from escape_hw.config.layouts import resolve_layout
+from escape_hw.deprecation import warn_renamed
 
 #: Error type of violated rules over several keys.
 RULE_ERROR = "rule"
@@ -48,3 +51,23 @@ def _list_to_tuple(value: Any) -> Any:
 
 #: ``TomlArray[tuple[float, ...]]``: a TOML array stored as a tuple, which keeps sections immutable.
 TomlArray = Annotated[T, BeforeValidator(_list_to_tuple)]
+
+
+#: Layouts that version 0.3.0 removes, and what is said about them.
+_RETIRED = {
+    "rings-336": "layout 'rings-336' was a guess of the MMT's mirror and goes in version 0.3.0; 'maps-336' "
+    "has the published positions, and matrices of the other layout must be measured again"
+}
+
+
+def _resolve_layout(layout: str) -> str:
+    if layout in _RETIRED:
+        warn_renamed(_RETIRED[layout])
+    try:
+        return resolve_layout(layout)
+    except ValueError as error:
+        raise PydanticCustomError("layout", "{text}", {"text": str(error)}) from error
+
+
+#: A layout, see :mod:`escape_hw.config.layouts`; the content of a file replaces the file's name.
+LayoutText = Annotated[str, AfterValidator(_resolve_layout)]

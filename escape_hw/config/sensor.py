@@ -4,11 +4,16 @@ from __future__ import annotations
 
 import math
 from itertools import combinations
-from typing import Annotated, Any, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from pydantic import Discriminator, Field, Tag, model_validator
 
-from escape_hw.config.section import RuleViolation, Section, TomlArray, raise_violations
+from escape_hw.config import layouts
+from escape_hw.config.section import LayoutText, RuleViolation, Section, TomlArray, raise_violations
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
 #: Kind of a section without ``kind``.
 _DEFAULT_KIND = "shack-hartmann"
@@ -41,6 +46,26 @@ class ShackHartmannSection(SensorSection):
     threshold: float = Field(
         0.02, ge=0, le=0.9, description="centre-of-gravity threshold above background, fraction of full scale"
     )
+    valid: LayoutText | None = Field(
+        None,
+        description="valid sub-apertures on the grid of n_sub x n_sub: 'circle-N', 'square-N', "
+        "'rows:4,6,6,4' (sub-apertures per row) or 'mask:FILE' (text, .npy or .fits); absent: those lit "
+        "above min_flux",
+    )
+
+    @model_validator(mode="after")
+    def _valid_rules(self) -> Self:
+        shape = (self.n_sub, self.n_sub)
+        if self.valid is not None and layouts.map_shape(self.valid) != shape:
+            has = layouts.map_shape(self.valid)
+            has_text = "is not on a grid" if has is None else f"has {has[0]} rows of {has[1]}"
+            text = f"{has_text}; n_sub = {self.n_sub} needs {self.n_sub} rows of {self.n_sub} columns"
+            raise_violations([RuleViolation("valid", layouts.shorten(self.valid), text)])
+        return self
+
+    def valid_map(self) -> NDArray[np.bool_] | None:
+        """Map ``(n_sub, n_sub)`` of the configured valid sub-apertures; ``None``: those that are lit."""
+        return None if self.valid is None else layouts.layout_map(self.valid)
 
 
 class PyramidSection(SensorSection):

@@ -26,7 +26,17 @@ def load_arrays(path: Path) -> NDArray[Any] | dict[str, NDArray[Any]]:
         It is no such file, an array claims more bytes than there are, or the arrays of an archive together
         need more than :data:`~escape_hw.bounded_files.MAX_ARRAY_BYTES`.
     """
-    content = read_bounded(path, MAX_ARRAY_BYTES)
+    return decode_arrays(read_bounded(path, MAX_ARRAY_BYTES))
+
+
+def decode_arrays(content: bytes) -> NDArray[Any] | dict[str, NDArray[Any]]:
+    """As :func:`load_arrays`, of the content of a file.
+
+    Raises
+    ------
+    ValueError
+        As there.
+    """
     try:
         if content.startswith(b"PK"):
             return _load_archive(content)

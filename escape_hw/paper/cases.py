@@ -20,6 +20,7 @@ from escape_hw.paper.experiments import (
     Table1Result,
     reproduce_maps,
     reproduce_pywfs,
+    reproduce_revolt,
     reproduce_shwfs,
     reproduce_table1,
 )
@@ -189,6 +190,11 @@ CASES = {
             "maps", "telescope with a contaminated mirror: matrix, simulation and loops", "maps-nir",
             {"frames": 60_000, "loop_frames": 10_000}, reproduce_maps,
             _save("maps", "Calibration on the sky, with a contaminated mirror"),
+        ),
+        PaperCase(
+            "revolt", "telescope with a Shack-Hartmann sensor: matrices and loops", "revolt-shwfs",
+            {"frames": 10_000, "loop_frames": 10_000}, reproduce_revolt,
+            _save("revolt", "Calibration on the sky"),
         ),
     )
 }  # fmt: skip

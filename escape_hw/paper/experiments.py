@@ -1,4 +1,4 @@
-"""The paper's experiments as procedures: Table 1, Shack-Hartmann bench, pyramid bench, telescope."""
+"""The paper's experiments as procedures: Table 1, Shack-Hartmann bench, pyramid bench, telescopes."""
 
 from __future__ import annotations
 
@@ -182,6 +182,41 @@ def _gains_and_loops(
         yield from close_loop_at_best_gain(bench, label, calibration, loop_frames, model, result)
         if result.partial:
             return
+
+
+def reproduce_revolt(
+    bench: Bench, *, frames: int = SHORT_FRAMES, loop_frames: int = 5000
+) -> Procedure[CalibrationComparison]:
+    """Calibrate a telescope with a Shack-Hartmann sensor on a star, and close the loop with every matrix.
+
+    All measurements are on the sky and share the geometry and the slope references of ESCAPE.
+
+    Parameters
+    ----------
+    frames
+        Frames of the DO-CRIME measurement.
+    loop_frames
+        Frames of each closed loop at its best gain.
+
+    Returns
+    -------
+    CalibrationComparison
+        Calibrations and loops of "push-pull", "DO-CRIME" and "ESCAPE".
+
+    Raises
+    ------
+    TooFewFrames
+        For the number of modes; nothing moved.
+    CalibrationError
+        No gain gives a stable loop.
+    """
+
+    def steps(result: CalibrationComparison) -> Procedure[None]:
+        yield from measure_matrices(bench, frames, result, common_geometry=True)
+        if not result.partial:
+            yield from _close_loops(bench, loop_frames, result)
+
+    return (yield from _comparison(bench, frames, steps))
 
 
 def reproduce_maps(

@@ -142,6 +142,13 @@ def _maps_numbers(run: RunContent | None) -> Iterator[PaperNumber]:
     )  # fmt: skip
 
 
+def _revolt_numbers(run: RunContent | None) -> Iterator[PaperNumber]:
+    for matrix in ("ESCAPE", "DO-CRIME"):
+        found = _difference(run, matrix, "push-pull")
+        yield PaperNumber(f"REVOLT, Strehl of {matrix} minus push-pull", "no number", found)
+    yield PaperNumber("REVOLT, loop speed", "500 Hz", _loop_speed(run))
+
+
 def _sweep_numbers(run: RunContent | None) -> Iterator[PaperNumber]:
     document = {} if run is None else run.document
     sweep = document.get("sweep")
@@ -168,6 +175,7 @@ PAPER_RUNS = (
     PaperRun("shwfs", "escape reproduce shwfs --loop-frames 30000", _shwfs_numbers),
     PaperRun("pywfs", "escape reproduce pywfs", _pywfs_numbers),
     PaperRun("maps", "escape reproduce maps", _maps_numbers),
+    PaperRun("revolt", "escape reproduce revolt", _revolt_numbers),
     PaperRun("sweep-shwfs", "escape sweep razor-shwfs --trials 1000", _sweep_numbers),
     PaperRun("sweep-pywfs", "escape sweep razor-pywfs --trials 1000 --frames 250", _sweep_numbers),
 )

@@ -7,6 +7,7 @@ import pytest
 from scipy import special
 from sensor_frames import N_PIX, WAVELENGTH, flat, pupil_amplitude, sensor
 
+from escape_hw.config import layouts
 from escape_hw.errors import CalibrationError
 from escape_hw.pipeline.geometry.lenslet_grid import _without_hot_pixels, find_lenslet_grid
 from escape_sim.atmosphere.phase_plates import RotatingScreen, von_karman_screen
@@ -125,6 +126,20 @@ def test_valid_sub_apertures_follow_the_light():
     bright = find(2 * frame, threshold=40.0)
     assert bright.counts == pytest.approx(2 * half.counts, rel=1e-5)
     assert (bright.valid == half.valid).all()
+
+
+def test_configured_sub_apertures_are_valid_whatever_the_light():
+    optics, _ = sensor(24, 15.55, (3.2, -1.7), (400, 400), 1.48)
+    valid = layouts.layout_map("rows:" + ",".join(["0", "10", *["14"] * 20, "10", "0"]))
+    valid = np.pad(valid, ((0, 0), (5, 5)))
+    frame = flat(optics)
+    grid, lit = find(frame, valid=valid), find(frame)
+    assert np.array_equal(grid.valid, valid)
+    assert grid.references_px.shape == (300, 2)
+    assert (grid.origin_px, grid.pitch_px) == (lit.origin_px, lit.pitch_px)
+    valid[23, :2] = True
+    with pytest.raises(CalibrationError, match=r"2 of the 302 .* are dark .* row 23, column 0"):
+        find(frame, valid=valid)
 
 
 @pytest.mark.parametrize("level", [0.0, 19.0])

@@ -5,21 +5,24 @@ Its influence functions are rounded exponentials and its slopes have no tip and 
 
 from __future__ import annotations
 
-import os
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
+from shared_data import SHARED, shared_data
 
 from escape_benchmarks.measured.dm97 import fit_matrix, read_matrix
 from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.calibration.sprint.fit import SprintFit
+from escape_hw.config.loader import load_system
+from escape_hw.io.interchange.arrays import import_arrays, read_description
+from escape_hw.runtime.session.array_target import array_target
 
-SHARED = Path(os.environ.get("ESCAPE_SHARED_DATA", Path(__file__).parents[3] / "shared" / "data"))
 FOLDER = SHARED / "dm97"
 #: One date for each of the three masks.
 DATES = ("20230901151403", "20231214151118", "20231219151519")
+#: Room for pupil images of 36 pixels.
+_PUPILS = "sensor.pupils_px=[[69.0,35.0],[111.0,35.0],[69.0,78.0],[109.0,77.0]]"
 
 pytestmark = [
     # Several tests read the same fits.
@@ -65,3 +68,27 @@ def test_broken_lenslets_are_named() -> None:
 def test_a_mirror_that_did_not_move_is_refused() -> None:
     estimate = fitted("20231214125445")[1].estimate
     assert not estimate.converged, estimate
+
+
+@pytest.mark.parametrize(
+    ("description", "system", "shape"),
+    [
+        ('file = "irtf/imat.12x12.20250910a.npy"\n[sensor]\nvalid = "irtf/validSubAps_12x12.npy"',
+         ("razor-shwfs", "sensor.n_sub=12", "devices.dm.layout=square-6", "basis.n_modes=36"), (232, 36)),
+        ('file = "maps/respM.fits.fz"\norder = "maps-beside"\n[sensor]\nvalid = "nonzero"',
+         ("maps-vis", "sensor.n_sub=36", _PUPILS), (2592, 336)),
+        ('file = "maps/MAPS-RMWFS.fits.fz"\norder = "maps-beside"\n[sensor]\nvalid = "nonzero"\n'
+         '[modes]\nfile = "maps/full_maps_m2c.fits"',
+         ("maps-vis", "sensor.n_sub=36", _PUPILS), (2592, 335)),
+    ],
+)  # fmt: skip
+def test_matrices_of_other_systems_are_imported(description, system, shape, tmp_path) -> None:
+    shared_data(description.partition('"')[2].partition("/")[0])
+    path = tmp_path / "matrix.toml"
+    path.write_text(f"[matrix]\nsimulated = false\n{description}\n")
+    config = load_system(system[0], overrides=system[1:])
+    matrix = import_arrays(read_description(path), SHARED, array_target(config)).matrix
+    assert matrix.data.shape == shape
+    assert matrix.m2c.shape[0] == config.devices.dm.n_act
+    assert not matrix.simulated
+    assert np.abs(matrix.data).max() > 0

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from escape_hw.api.registration import Registration
-from escape_hw.config import actuator_layouts
+from escape_hw.config import layouts
 from escape_sim.mirror.influence_functions import InfluenceFunctions, layout_positions
 from escape_sim.mirror.surface import make_mirror_surface
 from escape_sim.oopao.library import make_source, mis_registration, oopao_classes, suppress_output
@@ -70,7 +70,7 @@ def test_surfaces_equal_those_of_oopao(influence, mirror, registration):
 @pytest.mark.parametrize("registration", REGISTRATIONS[6:], ids=str)
 def test_rings_equal_those_of_oopao(registration):
     pitch = PUPIL_M / 22
-    rings = InfluenceFunctions(actuator_layouts.positions("rings-336") * pitch, pitch, 0.3)
+    rings = InfluenceFunctions(layouts.positions("rings-336") * pitch, pitch, 0.3)
     light = make_source(np.ones((48, 48), np.float32), PUPIL_M, 635e-9)
     with suppress_output():
         theirs = oopao_classes().DeformableMirror(

@@ -12,7 +12,7 @@ from escape_sim.devices.twins import SimAdaptiveSecondary, make_secondary
 from escape_sim.mirror.shell import FLOATING_GAP_M
 
 QUICK = [
-    "devices.dm.layout=rings-336",
+    "devices.dm.layout=maps-336",
     "twin.mirror.settling_s=1e-4",
     "basis.n_modes=20",
     "loop.dropped_modes=0",

@@ -48,7 +48,7 @@ def test_dm_verbs_have_their_documents(document):
         (("poke", "razor-shwfs", 0, 0.9), 2, "exceeds devices.dm.limits.max_stroke, 0.8"),
         (("poke", "razor-shwfs", 0, "nan"), 2, "max_stroke"),
         (("poke", "razor-shwfs", 0, 0.1, "--second", 1), 2, "--second"),
-        (("poke", "maps-nir", 248, 0.01), 2, "disabled"),
+        (("poke", "maps-nir", 260, 0.01), 2, "disabled"),
         (("poke", "maps-nir", 0, 0.5, "--seconds", 0), 3, "beyond its limits, which allow 0.2"),
         (("wave", "razor-shwfs", "--amplitude", 0.9), 3, "0.8 does not"),
     ],

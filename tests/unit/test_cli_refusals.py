@@ -5,10 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 
 import fake_results as fake
+import numpy as np
 import pytest
 
+from escape_hw.config.loader import load_system
 from escape_hw.io.fits.matrix import save_matrix
 from escape_hw.io.provenance import Provenance
+from escape_hw.runtime.procedures.matrix_input import load_fitting_matrix
 
 
 @pytest.mark.parametrize(
@@ -63,6 +66,29 @@ def test_matrix_of_another_system_basis_or_mode_is_refused(escape, bench, tmp_pa
     assert "actuators" in refused("dm", replace(good, m2c=good.m2c[:50]))
     hardware = ("--mode", "hardware", "--set", 'devices.screen.driver="manual"')
     assert "simulation" in refused("sim", good, fake.ORIGIN, *hardware)
+
+
+def test_matrix_of_another_layout_is_refused(escape, bench, tmp_path):
+    result = fake.calibration("escape")
+    rows = "devices.dm.layout=rows:5,7,9,11,11,11,11,11,9,7,5"
+    table = tmp_path / "positions.txt"
+    at = load_system("razor-shwfs").devices.dm.positions()
+    np.savetxt(table, at * 1.5e-3)
+    same = (f"devices.dm.layout=positions:{table}", "devices.dm.position_unit=metre")
+    np.savetxt(tmp_path / "turned.txt", at[::-1])
+    other = (f"devices.dm.layout=positions:{tmp_path / 'turned.txt'}",)
+    for overrides, refused in (((rows,), False), (same, False), (other, True)):
+        text = load_system("razor-shwfs", overrides=overrides).to_toml()
+        path = save_matrix(tmp_path / "im.fits", result, replace(fake.ORIGIN, config_text=text))
+        config = load_system("razor-shwfs")
+        if not refused:
+            assert load_fitting_matrix(path, config).matrix.n_modes == config.basis.n_modes
+            continue
+        code, _, err = escape("loop", "razor-shwfs", "--im", path)
+        assert code == 2
+        assert "was measured with the layout 'points:" in err.replace("\n", " ")
+        assert "with other positions: measure the matrix again" in " ".join(err.split())
+        assert not bench.benches
 
 
 def test_damaged_matrix_is_refused(document, bench, im):

@@ -12,6 +12,7 @@ from pydantic import ValidationError
 
 from escape_hw.config.bundled import bundled_systems, bundled_text
 from escape_hw.config.key_tree import all_keys, fields_of, locate_key, sections_of
+from escape_hw.config.layouts import FORMS
 from escape_hw.config.loader import load_system, load_text
 from escape_hw.config.system import SystemConfig
 from escape_hw.config.templates import starter_text
@@ -128,8 +129,7 @@ WRONG = {
         '"circle-11"',
         '"round"',
         '"round"',
-        'devices.dm.layout: "round"  is not allowed; expected: arrangement of the actuators: '
-        "'circle-N' or 'square-N' on an N x N grid, 'rings-336' or 'rings-672' on rings",
+        f"devices.dm.layout: \"round\"  layout 'round' is unknown; choose {FORMS}",
     ),
     "missing key": (
         "n_modes = 94",

@@ -14,7 +14,7 @@ import pytest
 
 from escape_hw.api.registration import PARAMETERS
 from escape_hw.api.results import Estimate
-from escape_hw.config import actuator_layouts
+from escape_hw.config import layouts
 from escape_hw.errors import IncompatibleProduct, ProductError
 from escape_hw.io import documents
 from escape_hw.io.fits.loop import save_loop
@@ -205,7 +205,7 @@ def test_loops_without_images_or_strehl_draw():
 
 
 def test_a_mirror_without_a_grid_is_drawn_where_its_actuators_stand(tmp_path):
-    places = actuator_layouts.positions("rings-336") * 0.03
+    places = layouts.positions("rings-336") * 0.03
     command = np.zeros(336)
     command[7] = 0.6
     figure = figures_bench.mirror_without_grid(command, places)

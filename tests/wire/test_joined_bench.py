@@ -17,6 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from small_system import SMALL
 
+from escape_hw.api.camera import Region
 from escape_hw.config.loader import load_system
 from escape_hw.errors import DeviceError, DeviceLost
 from escape_hw.runtime.session.system import System
@@ -144,3 +145,24 @@ def test_requests_arrive_whole_or_not_at_all(requests, cuts, missing) -> None:
     assert received == requests[: len(received)]
     whole = list(itertools.accumulate(8 + len(payload) for _, payload in requests))
     assert len(received) == sum(end <= len(stream) for end in whole)
+
+
+def test_a_genicam_camera_is_the_sensor_of_revolt() -> None:
+    changes = (
+        "basis.n_modes=20", "calibration.sprint_modes=20", "loop.dropped_modes=0", "calibration.poke=0.02",
+        'devices.science.sim_driver=""',
+    )  # fmt: skip
+    for name in ("asdk", "aravis"):
+        stand_in(name)
+    config = load_system("revolt-shwfs", overrides=changes)
+    with StandInBenchServer(config) as one, patch.dict(os.environ, one.environment):
+        for name in ("asdk", "aravis"):
+            stand_in(name).clear(record=False)
+        hardware = load_system("revolt-shwfs", mode="hardware", overrides=changes)
+        with System.from_config(hardware) as bench:
+            assert bench.wfs.info.model.startswith("C-BLUE One")
+            assert bench.wfs.settings.region == Region(626, 376, 352, 352)
+            found = bench.calibrate("docrime", frames=200)
+        assert found.grid.n_valid == 188
+        assert not stand_in("aravis").violations
+    stand_in("aravis").clear(record=False)

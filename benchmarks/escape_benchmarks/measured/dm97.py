@@ -6,25 +6,34 @@ slopes have no tip and tilt; the largest mask reaches beyond the 29 x 29 lenslet
 
 from __future__ import annotations
 
-import gzip
 import json
+from functools import cache
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.procedure import run
-from escape_hw.api.sensor import SubApertureGrid
+from escape_hw.api.results import CalibrationResult
+from escape_hw.api.sensor import SubApertureGrid, require_kind
 from escape_hw.api.synthetic_model import SyntheticModel
 from escape_hw.calibration.sprint.fit import SprintFit, fit_registration
 from escape_hw.config.loader import load_system
+from escape_hw.config.system import SystemConfig
+from escape_hw.io.interchange.arrays import (
+    ActuatorTable,
+    ArrayDescription,
+    MatrixTable,
+    SensorTable,
+    design_geometry,
+    import_arrays,
+)
+from escape_hw.runtime.session.array_target import array_target
 from escape_sim.models.factory import make_fast_model
 
 #: Lenslets across, with one more at each rim than the camera has.
 ACROSS = 31
 #: Pixels on the camera for a wavefront slope of one radian, and between lenslets.
-_PER_RADIAN, _PITCH, _CAMERA = 2654.5, 300 / 5.5, 2048
+_PER_RADIAN, _PITCH = 2654.5, 300 / 5.5
 #: Noise of an element in pixels per unit command, from the repeats of a matrix.
 NOISE = 0.26
 _DESIGN = (
@@ -42,27 +51,31 @@ def read_entries(folder: Path) -> list[dict[str, Any]]:
     return entries
 
 
+def read_calibration(folder: Path, date: str) -> CalibrationResult:
+    """A date's matrix in pixels per unit command, actuators in ESCAPE's order, with the nominal grid."""
+    entry = next(one for one in read_entries(folder) if one["date"] == date)
+    description = ArrayDescription(
+        matrix=MatrixTable(file=entry["file"], scale=_PER_RADIAN, sigma=NOISE / _PER_RADIAN, simulated=False),
+        sensor=SensorTable(valid=f"mask_{entry['n_valid']}.txt"),
+        actuators=ActuatorTable(transpose=True, flip_x=True, flip_y=True),
+    )
+    return import_arrays(description, folder, array_target(_system()))
+
+
 def read_matrix(folder: Path, date: str) -> InteractionMatrix:
-    """A date's matrix in pixels per unit command, actuators in ESCAPE's order."""
-    description = json.loads((folder / "dm97.json").read_text())
-    entry = next(one for one in description["entries"] if one["date"] == date)
-    with gzip.open(folder / entry["file"]) as packed:
-        columns = np.load(packed)
-    data = np.empty_like(columns)
-    data[:, description["matrix"]["escape_order"]] = _PER_RADIAN * columns
-    mask = np.loadtxt(folder / f"mask_{entry['n_valid']}.txt").astype(bool)
-    valid = np.pad(mask, (ACROSS - len(mask)) // 2)
-    sigma, single = np.full(data.shape, NOISE, np.float32), np.eye(data.shape[1])
-    return InteractionMatrix(data, sigma, single, valid, "ciao", "push-pull", False)
+    """The matrix of :func:`read_calibration`."""
+    return read_calibration(folder, date).matrix
 
 
 def make_model(matrix: InteractionMatrix) -> SyntheticModel:
     """The synthetic model of the nominal design: a Gaussian mirror of coupling 0.4."""
-    first = (_CAMERA - _PITCH * (ACROSS - 1)) / 2
-    references = np.zeros((int(matrix.valid.sum()), 2), np.float32)
-    light = matrix.valid.astype(np.float32)
-    grid = SubApertureGrid(_PITCH, (first, first), matrix.valid, references, light, 0.0)
-    return make_fast_model(load_system("razor-shwfs", overrides=_DESIGN), grid)
+    grid = design_geometry(matrix.valid, array_target(_system()))
+    return make_fast_model(_system(), require_kind(grid, SubApertureGrid))
+
+
+@cache
+def _system() -> SystemConfig:
+    return load_system("razor-shwfs", overrides=_DESIGN)
 
 
 def fit_matrix(matrix: InteractionMatrix) -> SprintFit:

@@ -23,8 +23,8 @@ from escape_drivers.common.options import (
     section_options,
 )
 from escape_hw.api.mirror import DeformableMirror, DMInfo
-from escape_hw.config.actuator_layouts import n_actuators
 from escape_hw.config.devices import mirror_info
+from escape_hw.config.layouts import n_actuators, shorten
 from escape_hw.config.section import Section
 from escape_hw.errors import CommandRejected, DeviceError, DeviceLost, NotOpen
 from escape_hw.safety.limits import CAUTIOUS_LIMITS, MirrorLimits
@@ -96,7 +96,7 @@ class AlpaoMirror(DeformableMirror):
     name
         Name in messages.
     layout
-        Arrangement of the actuators, see :mod:`escape_hw.config.actuator_layouts`; empty: by the number of
+        Arrangement of the actuators, see :mod:`escape_hw.config.layouts`; empty: by the number of
         actuators, the only part of the geometry that the SDK reports.
     pitch_m
         Distance between actuators, metres.
@@ -222,7 +222,7 @@ class AlpaoMirror(DeformableMirror):
         if n_act != (wanted := n_actuators(layout)):
             raise DeviceError(
                 self.name,
-                f"has {n_act} actuators, but the layout {layout!r} has {wanted}; "
+                f"has {n_act} actuators, but the layout {shorten(layout)!r} has {wanted}; "
                 f"correct devices.{self.name}.layout or the serial number",
             )
         version = format_version(library.get(handle, "VersionInfo"))

@@ -27,8 +27,8 @@ from escape_drivers.common.options import (
 from escape_hw.api.adaptive_secondary import AdaptiveSecondary, ShellHealth, ShellState
 from escape_hw.api.emulator import Emulator, EmulatorRequest
 from escape_hw.api.mirror import DMInfo
-from escape_hw.config.actuator_layouts import n_actuators
 from escape_hw.config.devices import mirror_info
+from escape_hw.config.layouts import n_actuators, shorten
 from escape_hw.config.registry import emulator_factory
 from escape_hw.errors import DeviceError, NotOpen, SettingRejected
 from escape_hw.safety.limits import CAUTIOUS_LIMITS, MirrorLimits
@@ -92,7 +92,7 @@ def require_identity(name: str, expected: ExpectedMirror, welcome: Welcome) -> N
     if welcome.last_command_m.size != n_act:
         raise DeviceError(
             name,
-            f"has {welcome.last_command_m.size} actuators, devices.{name}.layout = '{expected.layout}' has "
+            f"has {welcome.last_command_m.size} actuators, devices.{name}.layout = {shorten(expected.layout)!r} has "
             f"{n_act}; correct the layout or the address",
         )
     if expected.serial != welcome.serial:

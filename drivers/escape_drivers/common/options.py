@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
-from escape_hw.config import actuator_layouts
 from escape_hw.config.key_tree import range_text
+from escape_hw.config.layouts import n_actuators
 from escape_hw.config.section import Section
 from escape_hw.errors import ConfigError, DeviceError
 
@@ -18,6 +18,9 @@ if TYPE_CHECKING:
     from escape_hw.config.devices import CameraConfig, DeviceConfig, MirrorConfig
 
 Options = TypeVar("Options", bound=Section)
+
+#: Layouts of adaptive secondary mirrors by their number of actuators.
+_RINGS = {336: "maps-336", 672: "rings-672"}
 
 
 def parse_options(kind: type[Options], device: str, options: Mapping[str, Any]) -> Options:
@@ -63,7 +66,7 @@ def mirror_settings(device: str, section: MirrorConfig) -> dict[str, Any]:
     return {
         "name": device,
         "serial": section.serial,
-        "layout": section.layout,
+        "layout": section.layout_in_pitches(),
         "pitch_m": section.pitch_m,
         "stroke_m": section.stroke_m,
         "limits": section.limits.to_limits(),
@@ -98,13 +101,13 @@ def layout_of(device: str, n_act: int) -> str:
     DeviceError
         No known layout has so many.
     """
-    if n_act in actuator_layouts.RINGS:
-        return f"rings-{n_act}"
+    if n_act in _RINGS:
+        return _RINGS[n_act]
     for rows in range(2, 100):
-        if actuator_layouts.n_actuators(f"circle-{rows}") == n_act:
+        if n_actuators(f"circle-{rows}") == n_act:
             return f"circle-{rows}"
     raise DeviceError(
         device,
-        f"has {n_act} actuators, and no layout 'circle-N' or 'rings-N' has so many; give its layout "
+        f"has {n_act} actuators, and no layout 'circle-N', 'maps-336' or 'rings-672' has so many; give its layout "
         "(layout='square-N', or a system file)",
     )

@@ -19,7 +19,7 @@ from escape_drivers.streams.source import (
     with_stream_serial,
 )
 from escape_hw.api.mirror import DeformableMirror, DMInfo
-from escape_hw.config import actuator_layouts
+from escape_hw.config import layouts
 from escape_hw.config.devices import mirror_info
 from escape_hw.config.section import Section
 from escape_hw.errors import DeviceError, NotOpen
@@ -130,8 +130,8 @@ class StreamMirror(DeformableMirror):
     def _open(self) -> None:
         stream = self._stream = open_stream(self.name, self._open_named, self._options.stream, write=True)
         layout = self._layout = self._layout or layout_of(self.name, math.prod(stream.shape))
-        n_act = actuator_layouts.n_actuators(layout)
-        grid = actuator_layouts.actuator_map(layout) if actuator_layouts.is_on_grid(layout) else None
+        n_act = layouts.n_actuators(layout)
+        grid = layouts.layout_map(layout) if layouts.is_on_grid(layout) else None
         if stream.shape == (n_act,):
             self._actuator_indices = slice(None)
         elif grid is not None and stream.shape == grid.shape:

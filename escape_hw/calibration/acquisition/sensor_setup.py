@@ -56,6 +56,7 @@ class _ShackHartmann:
             threshold=self._threshold(bench),
             min_flux=self._section.min_flux,
             references="lattice" if references == "design" else references,
+            valid=self._section.valid_map(),
         )
 
     def refine_geometry(

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Generator
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
 
 from escape_hw.api.interaction_matrix import InteractionMatrix
+from escape_hw.api.registration import Registration
 from escape_hw.api.synthetic_model import DifferentiableModel, SyntheticModel
+from escape_hw.calibration.modes.derivatives import modal_matrix
 from escape_hw.calibration.sprint.least_squares import LeastSquaresFit, LeastSquaresProblem
 from escape_hw.calibration.sprint.weighted_matrix import WeightedMatrix
 
@@ -17,6 +20,10 @@ from escape_hw.calibration.sprint.weighted_matrix import WeightedMatrix
 MIN_EXPLAINED_FRACTION = 0.8
 #: Modes of the coarse descent; smoother modes have a wider basin of convergence.
 N_COARSE_MODES = 5
+#: Effective number of actuators in a column, as fraction of all, below which the columns are no modes.
+_LOCAL = 0.15
+#: Relative singular value of the model's matrix below which a combination of columns is left out.
+_SINGULAR = 0.1
 #: Grid of starting points, in % of a sub-aperture and degrees, and number of the best to descend from.
 _SHIFTS = 150.0 * np.arange(-4, 5)
 _ROTATIONS = np.array([-10.0, -5.0, 0.0, 5.0, 10.0])
@@ -83,12 +90,48 @@ def search_registration(
 def low_mode_problem(
     matrix: InteractionMatrix, model: SyntheticModel, columns: NDArray[np.intp], learning_rate: float = 1.0
 ) -> LeastSquaresProblem | None:
-    """The problem of the lowest columns; ``None`` if there are too few columns to omit some."""
+    """The problem of the lowest modes; ``None`` if there are too few columns to omit some."""
     if columns.size <= 2 * N_COARSE_MODES:
         return None
-    return LeastSquaresProblem(
-        WeightedMatrix.from_columns(matrix, np.sort(columns)[:N_COARSE_MODES]), model, learning_rate
+    return LeastSquaresProblem(weigh_low_modes(matrix, model, columns), model, learning_rate)
+
+
+def weigh_low_modes(
+    matrix: InteractionMatrix, model: SyntheticModel, columns: NDArray[np.intp]
+) -> WeightedMatrix:
+    """The lowest modes of a matrix, weighted.
+
+    These are its first columns. If single actuators or small groups move in them, as in a zonal matrix, they
+    are the combinations of columns with which the model makes tilts, focus and astigmatism.
+    """
+    columns = np.sort(columns)
+    if not _is_local(matrix.m2c[:, columns]):
+        return WeightedMatrix.from_columns(matrix, columns[:N_COARSE_MODES])
+    m2c = matrix.m2c[:, columns]
+    nominal = modal_matrix(model, Registration(), m2c)
+    combination = np.linalg.lstsq(nominal, _low_order_slopes(matrix.valid), rcond=_SINGULAR)[0]
+    combined = replace(
+        matrix,
+        data=(matrix.data[:, columns] @ combination).astype(np.float32),
+        sigma=np.sqrt(matrix.sigma[:, columns].astype(float) ** 2 @ combination**2).astype(np.float32),
+        m2c=m2c @ combination,
     )
+    return WeightedMatrix.from_columns(combined, np.arange(N_COARSE_MODES))
+
+
+def _is_local(m2c: NDArray[np.float64]) -> bool:
+    """Whether a few actuators dominate in the typical column ``(n_act, n)``."""
+    power = m2c**2
+    effective = power.sum(axis=0) ** 2 / np.maximum((power**2).sum(axis=0), np.finfo(float).tiny)
+    return float(np.median(effective)) < _LOCAL * len(m2c)
+
+
+def _low_order_slopes(valid: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Slopes ``(n_slopes, 5)`` of two tilts, focus and two astigmatisms."""
+    y, x = (np.argwhere(valid) - (np.array(valid.shape) - 1) / 2).T / (max(valid.shape) / 2)
+    one, zero = np.ones_like(x), np.zeros_like(x)
+    along_x, along_y = (one, zero, x, x, y), (zero, one, y, -y, x)
+    return np.concatenate([np.stack(along_x, axis=1), np.stack(along_y, axis=1)])
 
 
 def _coarse_to_fine(

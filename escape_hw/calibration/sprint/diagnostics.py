@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.synthetic_model import DifferentiableModel, SyntheticModel
-from escape_hw.calibration.sprint.coarse_search import MIN_EXPLAINED_FRACTION, N_COARSE_MODES
+from escape_hw.calibration.sprint.coarse_search import MIN_EXPLAINED_FRACTION, weigh_low_modes
 from escape_hw.calibration.sprint.least_squares import LeastSquaresProblem
 from escape_hw.calibration.sprint.weighted_matrix import WeightedMatrix
 
@@ -112,7 +112,7 @@ def check_orientation(
     """
     if not isinstance(model, DifferentiableModel):
         return None
-    weighted = WeightedMatrix.from_columns(matrix, np.sort(columns)[:N_COARSE_MODES])
+    weighted = weigh_low_modes(matrix, model, columns)
     for orientation, reoriented in _reoriented(weighted):
         problem = LeastSquaresProblem(reoriented, model)
         *_, fit = problem.descend(np.zeros(5), _ITERATIONS)

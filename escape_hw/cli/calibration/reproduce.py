@@ -15,7 +15,9 @@ from escape_hw.cli.options import SystemSelection
 
 app = typer.Typer(help="The paper's tables and figures in simulation, with a report.", no_args_is_help=True)
 _System = Annotated[SystemSelection, typer.Option("--system", help="System to run on.")]
-_SHWFS, _PYWFS, _MAPS = map(SystemSelection, ("razor-shwfs", "razor-pywfs", "maps-nir"))
+_SHWFS, _PYWFS, _MAPS, _REVOLT = map(
+    SystemSelection, ("razor-shwfs", "razor-pywfs", "maps-nir", "revolt-shwfs")
+)
 _LoopFrames = Annotated[int, typer.Option("--loop-frames", min=1, help="Frames of each loop.")]
 _DocrimeFrames = Annotated[int, typer.Option("--frames", min=1, help="Frames of the DO-CRIME run.")]
 
@@ -71,6 +73,20 @@ def maps(
     _show_comparison(context, *_run_case(context, "maps", counts, selection, out))
 
 
+@app.command("revolt")
+@command("reproduce revolt", quiet=True)
+def revolt(
+    context: CommandContext,
+    selection: _System = _REVOLT,
+    frames: _DocrimeFrames = 10_000,
+    loop_frames: _LoopFrames = 10_000,
+    out: options.Out = None,
+) -> None:
+    """Matrices and loops on the sky, on a telescope with a Shack-Hartmann sensor."""
+    counts = {"frames": frames, "loop_frames": loop_frames}
+    _show_comparison(context, *_run_case(context, "revolt", counts, selection, out))
+
+
 @app.command("table1")
 @command("reproduce table1", quiet=True)
 def table1(
@@ -93,7 +109,8 @@ def reproduce_all(
     context: CommandContext,
     out: Annotated[Path, typer.Option("--out", help="Folder with one folder for each part.")],
     only: Annotated[
-        list[str] | None, typer.Option("--only", help="A part (table1, shwfs, pywfs, maps); repeatable.")
+        list[str] | None,
+        typer.Option("--only", help="A part (table1, shwfs, pywfs, maps, revolt); repeatable."),
     ] = None,
     share: Annotated[
         float,

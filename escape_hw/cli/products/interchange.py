@@ -1,7 +1,8 @@
-"""``escape export`` and ``escape import``: files and streams of pyRTC, AOT and milk."""
+"""``escape export`` and ``escape import``: files and streams of pyRTC, AOT and milk, and plain arrays."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -19,7 +20,9 @@ if TYPE_CHECKING:
     from escape_hw.io.interchange.stream import Stream
 
 export_app = typer.Typer(help="Write files of other software: pyRTC, AOT, milk.", no_args_is_help=True)
-import_app = typer.Typer(help="Read files of other software: pyRTC, AOT, milk.", no_args_is_help=True)
+import_app = typer.Typer(
+    help="Read files of other software: pyRTC, AOT, milk, plain arrays.", no_args_is_help=True
+)
 
 _Product = Annotated[Path, typer.Argument(metavar="IM", help="Interaction matrix (FITS).")]
 _OutFile = Annotated[Path, typer.Option("--out", metavar="FILE", help="Product to write (FITS).")]
@@ -189,6 +192,29 @@ def import_aot(
     _save_import(context, out, replace(found, matrix=matrix), ours, file, telemetry)
 
 
+@import_app.command("arrays")
+@command("import arrays", without=("seed",))
+def import_plain_arrays(
+    context: CommandContext,
+    description: Annotated[
+        Path, typer.Argument(metavar="DESCRIPTION", help="Order, signs and units of the arrays (TOML).")
+    ],
+    selection: options.Selection,
+    out: _OutFile,
+    im: Annotated[
+        Path | None, typer.Option("--im", metavar="FILE", help="Matrix (default: matrix.file).")
+    ] = None,
+) -> None:
+    """Read a matrix in text, NumPy or FITS files as a product of a system."""
+    from escape_hw.io.interchange.arrays import described_files, import_arrays, read_description
+    from escape_hw.runtime.session.array_target import array_target
+
+    ours, facts = context.load_config(selection), read_description(description)
+    folder = description.absolute().parent
+    result = import_arrays(facts, folder, array_target(ours), im)
+    _save_import(context, out, result, ours, description, others=described_files(facts, folder, im))
+
+
 @import_app.command("milk")
 @command("import milk")
 def import_milk(
@@ -239,8 +265,9 @@ def _save_import(
     config: SystemConfig,
     source: Path,
     telemetry: Path | None = None,
+    others: Sequence[Path] = (),
 ) -> None:
-    """Save an imported calibration, with its source as its parent."""
+    """Save an imported calibration, with its source and other files as its parents."""
     from dataclasses import replace
 
     from escape_hw.cli.formatting import format_calibration, status_line
@@ -250,7 +277,8 @@ def _save_import(
     from escape_hw.runtime.session.record import config_provenance
 
     # The modes come from the file.
-    origin = replace(config_provenance(config), basis="file", parents={source.name: file_sha256(source)})
+    parents = {file.name: file_sha256(file) for file in (source, *others)}
+    origin = replace(config_provenance(config), basis="file", parents=parents)
     path = save_matrix(out, result, origin)
     context.show(
         status_line(result.matrix.simulated, result.partial), *format_calibration(result), f"im: {path}"

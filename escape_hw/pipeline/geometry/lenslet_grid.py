@@ -23,6 +23,8 @@ _NOISE_CONTRAST = 0.1
 _MAX_DISTANCE = 5.0
 #: Ratio of a pixel to its brightest neighbour above which it is hot and not part of a spot.
 _HOT_PIXEL_RATIO = 10.0
+#: Flux below which a sub-aperture is dark, relative to the brightest.
+_LEAST_FLUX = 0.02
 #: Fewest lit sub-apertures.
 _MIN_VALID = 6
 
@@ -108,6 +110,7 @@ def find_lenslet_grid(
     threshold: float,
     min_flux: float,
     references: str = "lattice",
+    valid: NDArray[np.bool_] | None = None,
 ) -> SubApertureGrid:
     """Find pitch, offset, valid sub-apertures and references on a mean frame.
 
@@ -128,11 +131,13 @@ def find_lenslet_grid(
     references
         ``"lattice"``: the lattice points (without a source); ``"mean"``: the mean spot positions (with a
         source).
+    valid
+        Valid sub-apertures ``(n_sub, n_sub)``; by default those above ``min_flux``.
 
     Raises
     ------
     CalibrationError
-        No regular spots, or too few lit sub-apertures.
+        No regular spots, too few lit sub-apertures, or valid ones that the camera does not show.
     """
     if references not in ("lattice", "mean"):
         raise ValueError(f"references is {references!r}; choose 'lattice' or 'mean'")
@@ -151,6 +156,8 @@ def find_lenslet_grid(
         pitch, x, y = _lattice_fit(rows, columns, spots, np.minimum(grid.flux[grid.valid], 1.0).astype(float))
     _check_lattice(light, pitch, nominal_pitch_px)
     grid = _build_grid(image, n_sub, pitch, (x, y), min_flux)
+    if valid is not None:
+        grid = _with_valid(grid, valid)
     if references == "mean":
         grid = replace(grid, references_px=_measure_spots(grid, light).astype(np.float32))
     return grid
@@ -210,7 +217,7 @@ def _build_grid(
     complete = (end - top >= int(pitch)) & (right - left >= int(pitch))
     flux = np.where(complete, np.maximum(flux, 0.0), 0.0).reshape(n_sub, n_sub)
     # Relative to the 95th percentile, which hot pixels do not affect.
-    counts = float(np.percentile(flux[flux > 0.02 * flux.max()], 95))
+    counts = float(np.percentile(flux[flux > _LEAST_FLUX * flux.max()], 95))
     flux = flux / counts
     valid = flux >= min_flux
     if valid.sum() < _MIN_VALID:
@@ -221,6 +228,19 @@ def _build_grid(
     return SubApertureGrid(
         pitch, origin, valid, np.zeros((int(valid.sum()), 2), np.float32), flux.astype(np.float32), counts
     )
+
+
+def _with_valid(grid: SubApertureGrid, valid: NDArray[np.bool_]) -> SubApertureGrid:
+    """The grid with a given set of valid sub-apertures."""
+    dark = valid & (grid.flux < _LEAST_FLUX)
+    if dark.any():
+        row, column = np.argwhere(dark)[0]
+        raise CalibrationError(
+            f"{int(dark.sum())} of the {int(valid.sum())} sub-apertures in sensor.valid are dark or beyond "
+            f"the camera region, the first in row {row}, column {column} (from 0); correct sensor.valid, "
+            "sensor.n_sub or devices.wfs.region"
+        )
+    return replace(grid, valid=valid, references_px=np.zeros((int(valid.sum()), 2), np.float32))
 
 
 def _measure_spots(grid: SubApertureGrid, light: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -65,6 +65,7 @@ class SprintProcedure(ComputedProcedure["CalibrationResult"], SprintParameters["
             expect_system=config.system.name,
             expect_sensor=config.sensor.kind,
             expect_actuators=config.devices.dm.n_act,
+            expect_sub_apertures=(config.sensor.n_sub, config.sensor.n_sub),
         )
 
     def compute(self) -> Procedure[CalibrationResult]:

@@ -181,6 +181,8 @@ class EngineSupervisor:
             engine.maintain_failsafe(failsafe_is_running)
         state = self._published.state
         limit = silence_limit_s(state, engine.process.pid, self._limits)
+        # The state may be the last one of an engine that died, whose mirror was made flat since.
+        is_current = state.engine_pid == engine.process.pid
         silence = now - engine.last_message_s
         if silence > limit:
             self._kill(engine, f"the engine was silent for {silence:.1f} s (limit {limit:g} s)")

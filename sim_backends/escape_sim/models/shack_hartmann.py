@@ -354,8 +354,9 @@ _MAX_DIRECT_MODES = 12
 def nominal_grid(config: SystemConfig) -> SubApertureGrid:
     """The design's grid, centred on the camera region; valid where the design flux is sufficient."""
     flux, n = nominal_flux(config), config.sensor.n_sub
-    valid = flux >= config.sensor.min_flux
-    pitch = config.sensor_as(ShackHartmannSection).pitch_px
+    section = config.sensor_as(ShackHartmannSection)
+    configured, pitch = section.valid_map(), section.pitch_px
+    valid = flux >= section.min_flux if configured is None else configured
     width, height = config.devices.wfs.region[2:]
     origin = ((width - 1) / 2 - pitch * (n - 1) / 2, (height - 1) / 2 - pitch * (n - 1) / 2)
     references = np.zeros((int(valid.sum()), 2), np.float32)

@@ -1,8 +1,9 @@
 /* Stand-in of libaravis-0.8: one GenICam camera, strict about references, buffers, order, and errors that are
  * not freed.
  *
- * Properties (set KEY VALUE): serial, width, height (of the sensor), increment (of size and offsets),
- * first_frame (its identifier), rate_switch (name of the feature that enables the frame rate).
+ * Properties (set KEY VALUE): profile (below; sets the next four), serial, width, height (of the sensor),
+ * increment (of size and offsets), first_frame (its identifier), rate_switch (name of the feature that enables
+ * the frame rate). ESCAPE_ARAVIS_PROFILE names the profile of a process.
  * For a pop, 'error N' delivers a buffer of that status, 'drop N' skips frames, 'timeout MS' delivers none.
  */
 #define _GNU_SOURCE
@@ -40,6 +41,17 @@ static struct {
     int64_t start_ns;
     long next;
 } stream;
+/* Cameras: a Grasshopper3 of FLIR, and a C-Blue One of First Light, which has no automatic exposure or gain,
+ * starts an exposure 5 us after the last, and reads 1104 rows in 1.5 ms. */
+static const struct profile {
+    const char *name, *model, *serial, *formats;
+    int width, height, has_auto;
+    double dead_us, fixed_us, row_us;
+} profiles[] = {
+    {"grasshopper3", "Grasshopper3", "SIMSCI", "Mono16 Mono12 Mono8", 720, 540, 1, 50, 200, 10},
+    {"c-blue-one", "C-BLUE One", "SIMCBLUE", "Mono12 Mono10 Mono8", 1604, 1104, 0, 5, 20, 1.36},
+};
+static const struct profile *profile;
 static char serial[64], rate_switch[64];
 static int sensor_w, sensor_h, increment, n_open_errors;
 static long first_frame;
@@ -48,15 +60,26 @@ static struct {
     uint16_t pixels[MAX_SIDE * MAX_SIDE];
 } from_bench;
 
+static int set_profile(const char *name) {
+    for (unsigned k = 0; k < sizeof profiles / sizeof *profiles; k++)
+        if (strcmp(profiles[k].name, name) == 0) {
+            profile = &profiles[k];
+            snprintf(serial, sizeof serial, "%s", profile->serial);
+            sensor_w = profile->width;
+            sensor_h = profile->height;
+            return 1;
+        }
+    return 0;
+}
+
 static void si_reset_device(void) {
     if (camera.linked) si_disconnect_bench(&camera.bench);
     memset(&camera, 0, sizeof camera);
     memset(&stream, 0, sizeof stream);
     camera.bench.fd = -1;
-    snprintf(serial, sizeof serial, "SIMSCI");
+    const char *wanted = getenv("ESCAPE_ARAVIS_PROFILE");
+    if (wanted == NULL || !set_profile(wanted)) set_profile(profiles[0].name);
     snprintf(rate_switch, sizeof rate_switch, "AcquisitionFrameRateEnable");
-    sensor_w = 720;
-    sensor_h = 540;
     increment = 2;
     first_frame = 65401; /* a run of a few seconds crosses the end of the 16-bit counter */
     n_open_errors = 0;
@@ -64,6 +87,7 @@ static void si_reset_device(void) {
 
 static int si_set_property(const char *key, const char *value) {
     int integer = atoi(value);
+    if (strcmp(key, "profile") == 0) return set_profile(value);
     if (strcmp(key, "serial") == 0) return snprintf(serial, sizeof serial, "%s", value) > 0;
     if (strcmp(key, "rate_switch") == 0) return snprintf(rate_switch, sizeof rate_switch, "%s", value) > 0;
     if (strcmp(key, "width") == 0) return (sensor_w = integer) > 0 && integer <= MAX_SIDE;
@@ -130,7 +154,7 @@ EXPORT void *arv_camera_new(const char *name, GError **error) {
         return set_error(error, "busy: used by another process"), NULL;
     }
     uint32_t greeting[1];
-    int linked = si_connect_bench(&camera.bench, "science", serial, greeting, sizeof greeting);
+    int linked = si_connect_bench(&camera.bench, "camera", serial, greeting, sizeof greeting);
     if (linked < 0) return set_error(error, "the simulated bench has no such camera"), NULL;
     camera.linked = linked;
     camera.x = camera.y = 0;
@@ -168,11 +192,13 @@ EXPORT void g_object_unref(void *object) {
 }
 
 /* ---- features ----------------------------------------------------------------------------------------- */
-static double fastest_hz(void) { return 1e6 / fmax(200 + 10.0 * camera.height, camera.exposure_us + 50); }
+static double fastest_hz(void) {
+    return 1e6 / fmax(profile->fixed_us + profile->row_us * camera.height, camera.exposure_us + profile->dead_us);
+}
 
 EXPORT const char *arv_camera_get_model_name(void *handle, GError **error) {
     BEGIN("arv_camera_get_model_name", NULL, "%s", "");
-    return "Grasshopper3";
+    return profile->model;
 }
 
 #define INT_PAIR_GETTER(name, one, other)                                                                     \
@@ -248,14 +274,15 @@ EXPORT void arv_camera_get_region(void *handle, int *x, int *y, int *width, int 
 
 EXPORT void arv_camera_set_pixel_format_from_string(void *handle, const char *format, GError **error) {
     BEGIN("arv_camera_set_pixel_format_from_string", , " %s", format);
-    if (strcmp(format, "Mono16") && strcmp(format, "Mono12") && strcmp(format, "Mono8"))
+    if (strncmp(format, "Mono", 4) || strstr(profile->formats, format) == NULL)
         return set_error(error, "[PixelFormat] entry not found");
     camera.bytes = strcmp(format, "Mono8") ? 2 : 1;
 }
 
 EXPORT int arv_camera_is_feature_available(void *handle, const char *name, GError **error) {
     BEGIN("arv_camera_is_feature_available", 0, " %s", name);
-    return !strcmp(name, rate_switch) || !strcmp(name, "ExposureAuto") || !strcmp(name, "GainAuto");
+    int is_auto = !strcmp(name, "ExposureAuto") || !strcmp(name, "GainAuto");
+    return !strcmp(name, rate_switch) || (is_auto && profile->has_auto);
 }
 
 EXPORT void arv_camera_set_boolean(void *handle, const char *name, int value, GError **error) {
@@ -266,7 +293,7 @@ EXPORT void arv_camera_set_boolean(void *handle, const char *name, int value, GE
 
 EXPORT void arv_camera_set_string(void *handle, const char *name, const char *value, GError **error) {
     BEGIN("arv_camera_set_string", , " %s %s", name, value);
-    if (strcmp(name, "ExposureAuto") && strcmp(name, "GainAuto")) set_error(error, "node not found");
+    if (!profile->has_auto || (strcmp(name, "ExposureAuto") && strcmp(name, "GainAuto"))) set_error(error, "node not found");
 }
 
 EXPORT unsigned arv_camera_get_payload(void *handle, GError **error) {

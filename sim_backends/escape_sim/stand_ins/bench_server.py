@@ -54,6 +54,9 @@ VARIABLES = {
     "m3api": "ESCAPE_XIMEA_LIBRARY",
     "aravis": "ESCAPE_ARAVIS_LIBRARY",
 }
+#: Cameras that the stand-in of Aravis can be, by the size of their sensor; others are a Grasshopper3.
+_ARAVIS_PROFILES = {(1604, 1104): "c-blue-one"}
+_PROFILE_VARIABLE = "ESCAPE_ARAVIS_PROFILE"
 _SOCKET_VARIABLE = "ESCAPE_STAND_IN_BENCH"
 #: Environment variable by which the modulator's driver finds the emulated controller.
 E727_VARIABLE = "ESCAPE_E727"
@@ -119,9 +122,21 @@ class StandInBenchServer:
             path,
             lambda connection, *_: self._serve(connection),  # type: ignore[arg-type]  # called like a class
         )
-        self.environment = {**libraries, _SOCKET_VARIABLE: path, **self._start_modulator_emulator()}
+        self.environment = {
+            **libraries,
+            _SOCKET_VARIABLE: path,
+            **self._aravis_profile(),
+            **self._start_modulator_emulator(),
+        }
         BackgroundThread("bench", lambda: server.serve_forever(_STOP_POLL_S)).start()
         return path
+
+    def _aravis_profile(self) -> dict[str, str]:
+        """Environment variable of the camera that the stand-in of Aravis is."""
+        cameras = (self.config.devices.wfs, self.config.devices.science)
+        sizes = [one.sensor_px for one in cameras if one is not None and one.driver == "aravis"]
+        names = [_ARAVIS_PROFILES[size] for size in sizes if size in _ARAVIS_PROFILES]
+        return {_PROFILE_VARIABLE: names[0]} if names else {}
 
     def _start_modulator_emulator(self) -> dict[str, str]:
         """Start the emulated controller, which moves the simulated beam; returns its environment variable."""
@@ -183,6 +198,9 @@ class StandInBenchServer:
         """Select the device of a stand-in by kind and serial number, which must be the configured one."""
         kind, _, serial = payload.decode(errors="replace").partition(" ")
         devices = self.config.devices
+        if kind == "camera":
+            # A GenICam camera, which may be either.
+            kind = "wfs" if serial.upper() == devices.wfs.serial.upper() else "science"
         section = {"mirror": devices.dm, "wfs": devices.wfs, "science": devices.science}.get(kind)
         if section is None or serial.upper() != section.serial.upper():
             log.warning("no %s with serial number %r on this bench", kind, serial)
