@@ -22,6 +22,7 @@ from escape_gui.views import procedure_form as form_text
 from escape_gui.views.mode_maps import ModeStatistics
 from escape_gui.widgets.argument_form import ArgumentForm
 from escape_gui.widgets.controls import row, scroll_area, set_available, text_label
+from escape_gui.widgets.inputs import ignore_wheel_without_focus
 from escape_hw.remote.source import DataSource, Sample
 from escape_hw.remote.state import Arguments, FinishedRun, ProcedureEntry, ProcedurePlan, State
 
@@ -68,6 +69,7 @@ class ProcedurePanel(Panel):
     def _make_form(self) -> None:
         self.choice = QComboBox()
         self.choice.setAccessibleName("Procedure")
+        ignore_wheel_without_focus(self.choice)
         self.choice.currentIndexChanged.connect(self._on_procedure_selected)
         self._description = text_label()
         self.form = ArgumentForm()
