@@ -31,9 +31,10 @@ from escape_gui.settings import Settings, save_settings
 from escape_gui.theme import Theme
 from escape_gui.widgets.controls import Level, Overlay, column
 from escape_gui.window.actions import ACTIONS, MENUS, format_shortcuts, help_page, keyboard_table
+from escape_gui.window.closing import CloseQuestion, is_busy
 from escape_gui.window.docks import WORKSPACES, Dock, arrange_docks, hide_orphan_tab_bars, workspace
 from escape_gui.window.export import Exporter
-from escape_gui.window.header import FaultBanner, HeaderBar
+from escape_gui.window.header import ControlBanner, FaultBanner, HeaderBar
 from escape_gui.window.notifications import NotificationBar, StateNotifier
 from escape_gui.window.update_timer import UpdateTimer
 from escape_hw.errors import StorageError
@@ -76,6 +77,7 @@ class MainWindow(QMainWindow):
             self.context, self.actions_by_name["open_loop"], self.actions_by_name["flatten"]
         )
         self.fault_banner = FaultBanner(self.context, self.actions_by_name["clear_fault"])
+        self.control_banner = ControlBanner(self.context, self.actions_by_name["take_control"])
         self.tabs = self._make_tabs()
         self.panels = {kind.name: kind(self.context) for kind in panels}
         self.docks = {name: self._make_dock(panel) for name, panel in self.panels.items()}
@@ -100,6 +102,11 @@ class MainWindow(QMainWindow):
         )
         #: Windows in which recorded runs were opened from this one.
         self.replay_windows: list[MainWindow] = []
+        #: Whether this window started the server, and whether that server goes on without the window.
+        self.started_server = self.leave_server = False
+        #: Open question before closing.
+        self.close_question: CloseQuestion | None = None
+        self._may_close = False
         session.failed.connect(
             lambda what, why: self.notifications.show_message(Level.ERROR, f"Could not {what}", why)
         )
@@ -192,7 +199,7 @@ class MainWindow(QMainWindow):
                     submenu.addAction(dock.toggleViewAction())
         bar.setCornerWidget(self.tabs, Qt.Corner.TopRightCorner)
         top = QWidget()
-        column(bar, self.header, self.fault_banner, parent=top, spacing=0)
+        column(bar, self.header, self.fault_banner, self.control_banner, parent=top, spacing=0)
         self.setMenuWidget(top)
 
     # ------------------------------------------------------------ layout
@@ -259,6 +266,7 @@ class MainWindow(QMainWindow):
         state = now.state
         self.header.show_state(state, connected=now.connected, live=now.live, mine=now.may_write)
         self.fault_banner.show_state(state)
+        self.control_banner.show_state(state, offered=now.connected and now.live and not now.may_write)
         for one in ACTIONS:
             reason = one.unavailable(now)
             action = self.actions_by_name[one.name]
@@ -333,8 +341,42 @@ class MainWindow(QMainWindow):
         other.update_timer.start()
         other.show()
 
+    def close_without_question(self) -> None:
+        """Close; a server that this window started goes on if something runs there."""
+        self.leave_server = is_busy(self.context.session.source.state)
+        self._may_close = True
+        self.close()
+
+    def _answer_close_question(self, leave_server: bool) -> None:
+        self.leave_server, self._may_close = leave_server, True
+        self.close()
+
+    def _may_close_now(self) -> bool:
+        """Whether nothing has to be asked before closing; otherwise ask."""
+        session = self.context.session
+        state = session.source.state
+        if self._may_close or session.control is None or not session.source.connected:
+            return True
+        if not (self.started_server or is_busy(state)):
+            return True
+        if self.close_question is None:
+            question = CloseQuestion(self, state, mine=session.may_write, started_server=self.started_server)
+            question.answered.connect(self._answer_close_question)
+            question.finished.connect(self._forget_close_question)
+            self.close_question = question
+            question.open()
+        return False
+
+    def _forget_close_question(self) -> None:
+        if self.close_question is not None:
+            self.close_question.deleteLater()
+            self.close_question = None
+
     def closeEvent(self, event: QCloseEvent) -> None:
-        """Save settings and layout; a connected server keeps running."""
+        """Save settings and layout; ask first while something runs, or if this window started the server."""
+        if not self._may_close_now():
+            event.ignore()
+            return
         self.update_timer.stop()
         self.replay.close()
         for other in self.replay_windows:

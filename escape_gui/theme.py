@@ -209,8 +209,8 @@ QDoubleSpinBox::up-button, QDoubleSpinBox::down-button { subcontrol-origin: bord
 QDoubleSpinBox::up-button { subcontrol-position: top right; }
 QDoubleSpinBox::down-button { subcontrol-position: bottom right; }
 QDoubleSpinBox::up-button:hover, QDoubleSpinBox::down-button:hover { background: @button; }
-QDoubleSpinBox::up-arrow { image: url(@up); width: @8px; height: @8px; }
-QDoubleSpinBox::down-arrow { image: url(@arrow); width: @8px; height: @8px; }
+QDoubleSpinBox::up-arrow { image: url(@up); width: @12px; height: @12px; }
+QDoubleSpinBox::down-arrow { image: url(@arrow); width: @12px; height: @12px; }
 QDoubleSpinBox::up-arrow:off, QDoubleSpinBox::down-arrow:off { image: none; }
 QLineEdit:disabled, QDoubleSpinBox:disabled, QComboBox:disabled { color: @muted; }
 QComboBox::drop-down { border: none; width: @16px; padding-right: @2px; }

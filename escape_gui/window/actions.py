@@ -58,7 +58,8 @@ ACTIONS: tuple[Action, ...] = (
            ("Ctrl+Shift+S",)),
     Action("save_window", "&File", "Save &window as image…", "Save the whole window as PNG.",
            ("Ctrl+Shift+P",)),
-    Action("quit", "&File", "&Quit", "Close the window; the server keeps running.", ("Ctrl+Q",)),
+    Action("quit", "&File", "&Quit", "Close the window; asks while a procedure runs or the loop is closed.",
+           ("Ctrl+Q",)),
     *(
         Action(f"workspace_{one.name}", "&View", f"&{number} {one.title}", f"{one.purpose}.",
                (f"Ctrl+{number}",))

@@ -171,6 +171,49 @@ def _follow_action(button: QPushButton, action: QAction) -> None:
     synchronise()
 
 
+#: Silence of the client in control from which the window offers to take over; several heartbeats, seconds.
+_SILENCE_S = 3.0
+
+
+def control_offer(state: State) -> str:
+    """Why control is offered: nobody has it, or its holder is silent; empty if somebody has it."""
+    lease, run = state.lease, state.active_run
+    if lease is not None:
+        if lease.silent_s < _SILENCE_S:
+            return ""
+        return (
+            f"{lease.name} on {lease.host} has not responded for {lease.silent_s:.0f} s and loses control in "
+            f"{lease.expires_in_s:.0f} s"
+        )
+    if run is None:
+        return f"No operator has control{'; the loop stays closed' if state.loop.closed else ''}"
+    text = f"No operator has control; '{run.name}' (run {run.id})"
+    if not state.unattended_limit_s:
+        return f"{text} goes on"
+    return f"{text} is aborted in {max(0.0, state.unattended_limit_s - state.unattended_for_s):.0f} s"
+
+
+class ControlBanner(QWidget):
+    """A row below the header that offers control with a button, visible while nobody uses it."""
+
+    def __init__(self, context: Context, take_control: QAction) -> None:
+        super().__init__()
+        self._indicator = StatusIndicator(context.theme)
+        self._indicator.set_status(Level.WARNING, "NO CONTROL")
+        self.text = text_label()
+        self.button = QPushButton("Take control")
+        self.button.clicked.connect(take_control.trigger)
+        _follow_action(self.button, take_control)
+        row(self._indicator, (self.text, 1), self.button, parent=self).setContentsMargins(8, 4, 8, 4)
+        self.hide()
+
+    def show_state(self, state: State, *, offered: bool) -> None:
+        """Show or hide the row; ``offered``: this window can take control and does not have it."""
+        text = control_offer(state) if offered and is_measured(state) else ""
+        self.text.setText(text)
+        self.setVisible(bool(text))
+
+
 class FaultBanner(QWidget):
     """A row below the header, visible during a fault, with a button for the action that clears it."""
 

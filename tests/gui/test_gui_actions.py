@@ -89,7 +89,7 @@ CHECKS: dict[str, Callable[[Stage], None]] = {
     "save_csv": _saved_csv,
     "save_fits": _saved_fits,
     "save_window": lambda s: s.saved("png"),
-    "quit": lambda s: s.bot.waitUntil(lambda: not s.window.isVisible()),
+    "quit": lambda s: s.bot.waitUntil(lambda: s.window.close_question is not None),
     "workspace_align": _workspace("align"),
     "workspace_calibrate": _workspace("calibrate"),
     "workspace_operate": _workspace("operate"),

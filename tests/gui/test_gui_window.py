@@ -289,7 +289,7 @@ def test_layout_and_theme_are_saved(make_window: MakeWindow, tmp_path: Path) -> 
     window.show_workspace("align")
     window.toggle_theme()
     window.context.theme.step_scale(+1)
-    window.close()
+    window.close_without_question()
     settings, warnings = load_settings(settings_path)
     assert warnings == ()
     window = make_window(settings=settings)

@@ -37,7 +37,8 @@ class PublishedState:
             update={
                 "serial": before.serial + 1, "server_pid": os.getpid(), "lease": self._leases.lease,
                 "clients": self._leases.count, "refused_requests": self._transport.refused,
-                "notes": before.notes,
+                "notes": before.notes, "unattended_for_s": self._leases.seconds_without_holder(),
+                "unattended_limit_s": before.unattended_limit_s,
             }
         )  # fmt: skip
         self._transport.publish("state", self.state)
