@@ -25,6 +25,7 @@ from escape_gui.client.availability import tooltip
 from escape_gui.client.session import Session
 from escape_gui.panels import PANELS
 from escape_gui.panels.base import Context, Panel
+from escape_gui.panels.loop import LoopPanel
 from escape_gui.replay.playback import PlaybackBar, RecordingOpener
 from escape_gui.replay.source import ReplaySource
 from escape_gui.settings import Settings, save_settings
@@ -36,6 +37,7 @@ from escape_gui.window.docks import WORKSPACES, Dock, arrange_docks, hide_orphan
 from escape_gui.window.export import Exporter
 from escape_gui.window.header import ControlBanner, FaultBanner, HeaderBar
 from escape_gui.window.notifications import NotificationBar, StateNotifier
+from escape_gui.window.run_browser import RunBrowser
 from escape_gui.window.update_timer import UpdateTimer
 from escape_hw.errors import StorageError
 
@@ -95,11 +97,17 @@ class MainWindow(QMainWindow):
         self.update_timer = UpdateTimer(session, self.panels.values(), self.refresh)
         self.playback_bar = PlaybackBar(session)
         self.addToolBar(Qt.ToolBarArea.BottomToolBarArea, self.playback_bar)
-        self.replay = RecordingOpener(self)
+        self.replay = RecordingOpener(self, session)
         self.replay.opened.connect(self.show_recording)
         self.replay.failed.connect(
             lambda why: self.notifications.show_message(Level.ERROR, "Cannot be opened", why)
         )
+        self.run_browser = RunBrowser(self, session)
+        self.run_browser.replay_requested.connect(self.replay.open)
+        loop = self.panels.get(LoopPanel.name)
+        if isinstance(loop, LoopPanel):
+            loop.load_button.clicked.connect(self.run_browser.open_list)
+            self.run_browser.matrix_loaded.connect(lambda product: loop.choose_matrix(product.name))
         #: Windows in which recorded runs were opened from this one.
         self.replay_windows: list[MainWindow] = []
         #: Whether this window started the server, and whether that server goes on without the window.
@@ -136,6 +144,7 @@ class MainWindow(QMainWindow):
         ask = session.ask
         return {
             "open_product": self.replay.ask_product,
+            "runs": self.run_browser.open_list,
             "open_run": self.replay.ask_run,
             "save_png": lambda: self.exporter.panel("png", self.focused_panel()),
             "save_csv": lambda: self.exporter.panel("csv", self.focused_panel()),
@@ -379,6 +388,7 @@ class MainWindow(QMainWindow):
             return
         self.update_timer.stop()
         self.replay.close()
+        self.run_browser.shut_down()
         for other in self.replay_windows:
             other.close()
             other.context.session.close()

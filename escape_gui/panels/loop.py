@@ -57,6 +57,8 @@ class LoopPanel(Panel):
         self.modes = caption()
         self.matrix = QComboBox()
         ignore_wheel_without_focus(self.matrix)
+        self.load_button = QPushButton("Load…")
+        self.load_button.setToolTip("Load the matrix of another run, also of an earlier night, or of a file")
         self.gain = NumberBox(*LIMITS["gain"], step=0.05, decimals=4)
         self.leak = NumberBox(*LIMITS["leak"], step=0.005, decimals=4)
         self.dropped_modes = NumberBox(*LIMITS["dropped_modes"], step=1, decimals=0)
@@ -96,6 +98,8 @@ class LoopPanel(Panel):
             wide = name == "matrix"
             form.addWidget(self.current[name], 2 * line, 1, 1, 2 if wide else 1)
             form.addWidget(self.editors[name], 2 * line + wide, 1 if wide else 2, 1, 2 if wide else 1)
+            if wide:
+                form.addWidget(self.load_button, 2 * line + 1, 3, Qt.AlignmentFlag.AlignLeft)
             limits = f", {LIMITS[name][0]:g} to {LIMITS[name][1]:g}" if name in LIMITS else ""
             self.editors[name].setToolTip(f"{_TIPS[name]}{limits}")
             self.editors[name].setAccessibleName(f"{text} setpoint")
@@ -185,6 +189,13 @@ class LoopPanel(Panel):
         self._checked_edit = None
         errors = self.edit.validation_errors(self._loop)
         self._show_message("\n".join(errors) or "Edited; press Check.", errors=bool(errors))
+
+    def choose_matrix(self, name: str) -> None:
+        """Choose a matrix that was loaded as the setpoint."""
+        self.on_state(self.context.session.source.state)
+        if name in self._matrices:
+            self.matrix.setCurrentText(name)
+            self._on_edit("matrix")
 
     def _follow_state(self) -> None:
         """Set the fields that the operator did not edit to the current values."""

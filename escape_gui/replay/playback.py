@@ -9,7 +9,7 @@ from PySide6.QtCore import QEvent, QObject, Qt, QTimer, Signal
 from PySide6.QtGui import QDropEvent
 from PySide6.QtWidgets import QFileDialog, QLabel, QSlider, QToolBar, QToolButton, QWidget
 
-from escape_gui.client.session import Session
+from escape_gui.client.session import Session, runs_folder
 from escape_gui.replay.source import ReplaySource
 from escape_hw.errors import EscapeError
 
@@ -23,23 +23,29 @@ class RecordingOpener(QObject):
     failed = Signal(str)
     _read = Signal(object)
 
-    def __init__(self, window: QWidget) -> None:
+    def __init__(self, window: QWidget, session: Session) -> None:
         super().__init__(window)
-        self._window = window
+        self._window, self._session = window, session
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="escape-replay")
         window.setAcceptDrops(True)
         window.installEventFilter(self)
         self._read.connect(self._on_read, Qt.ConnectionType.QueuedConnection)
 
     def ask_product(self) -> None:
-        chosen, _ = QFileDialog.getOpenFileName(self._window, "Open a product", "", "Products (*.fits)")
+        chosen, _ = QFileDialog.getOpenFileName(
+            self._window, "Open a product", self._folder(), "Products (*.fits)"
+        )
         if chosen:
             self.open(Path(chosen))
 
     def ask_run(self) -> None:
-        chosen = QFileDialog.getExistingDirectory(self._window, "Open the folder of a run")
+        chosen = QFileDialog.getExistingDirectory(self._window, "Open the folder of a run", self._folder())
         if chosen:
             self.open(Path(chosen))
+
+    def _folder(self) -> str:
+        """Folder in which the dialogs open."""
+        return str(runs_folder(self._session))
 
     def open(self, path: Path) -> None:
         """Start to read a product or a run folder; returns at once."""

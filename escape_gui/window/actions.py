@@ -48,6 +48,8 @@ MENUS = ("&File", "&View", "&Loop", "&Help")
 # fmt: off
 ACTIONS: tuple[Action, ...] = (
     Action("open_product", "&File", "&Open product…", "Show a FITS product in these panels.", ("Ctrl+O",)),
+    Action("runs", "&File", "Runs and &matrices…", "Finished runs: load a matrix into the loop, or replay.",
+           ("Ctrl+M",)),
     Action("open_run", "&File", "Open &run folder…", "Replay a finished run in these panels.",
            ("Ctrl+Alt+O",)),
     Action("save_png", "&File", "Save panel as &image…", "Save the panel with the focus as PNG.",
