@@ -57,7 +57,7 @@ class LoopPanel(Panel):
         self.modes = caption()
         self.matrix = QComboBox()
         ignore_wheel_without_focus(self.matrix)
-        self.load_button = QPushButton("Load…")
+        self.load_button = QPushButton("Load matrix…")
         self.load_button.setToolTip("Load the matrix of another run, also of an earlier night, or of a file")
         self.gain = NumberBox(*LIMITS["gain"], step=0.05, decimals=4)
         self.leak = NumberBox(*LIMITS["leak"], step=0.005, decimals=4)
@@ -98,14 +98,12 @@ class LoopPanel(Panel):
             wide = name == "matrix"
             form.addWidget(self.current[name], 2 * line, 1, 1, 2 if wide else 1)
             form.addWidget(self.editors[name], 2 * line + wide, 1 if wide else 2, 1, 2 if wide else 1)
-            if wide:
-                form.addWidget(self.load_button, 2 * line + 1, 3, Qt.AlignmentFlag.AlignLeft)
             limits = f", {LIMITS[name][0]:g} to {LIMITS[name][1]:g}" if name in LIMITS else ""
             self.editors[name].setToolTip(f"{_TIPS[name]}{limits}")
             self.editors[name].setAccessibleName(f"{text} setpoint")
         form.setColumnStretch(2, 1)
         form.setColumnStretch(3, 1)
-        self.body.addLayout(row(self.loop_indicator, self.modes, None))
+        self.body.addLayout(row(self.loop_indicator, self.modes, None, self.load_button))
         self.body.addLayout(form)
         self.body.addLayout(row(self.check_button, self.apply_button, self.revert_button, None))
         self.body.addWidget(self.message)
@@ -254,6 +252,7 @@ class LoopPanel(Panel):
         """Show a message until the next edit or request."""
         self._message_colour = "bad" if errors else "text"
         self.message.setText(text)
+        self.message.setVisible(bool(text))
         self._apply_message_colour()
 
     def _apply_message_colour(self) -> None:

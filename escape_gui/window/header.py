@@ -199,7 +199,7 @@ class ControlBanner(QWidget):
     def __init__(self, context: Context, take_control: QAction) -> None:
         super().__init__()
         self._indicator = StatusIndicator(context.theme)
-        self._indicator.set_status(Level.WARNING, "NO CONTROL")
+        self._indicator.set_status(Level.WARNING, "CONTROL")
         self.text = text_label()
         self.button = QPushButton("Take control")
         self.button.clicked.connect(take_control.trigger)

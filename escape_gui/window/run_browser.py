@@ -73,7 +73,6 @@ class RunBrowser(QDialog):
         column(self.filter, (self.table, 1), self.verdict, buttons, parent=self).setContentsMargins(
             12, 12, 12, 12
         )
-        self.resize(min(960, window.width() - 32), min(560, window.height() - 64))
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="escape-runs")
         self._listed.connect(self._show_runs, Qt.ConnectionType.QueuedConnection)
         self._enable()
@@ -99,6 +98,8 @@ class RunBrowser(QDialog):
         self.verdict.setText("Reading the run folder…")
         future = self._pool.submit(lambda folder: list(read_runs(folder)), runs_folder(self._session))
         future.add_done_callback(self._listed.emit)
+        window = self.parentWidget()
+        self.resize(min(1000, window.width() - 32), min(560, window.height() - 64))
         self.show()
         self.raise_()
         self.filter.setFocus()
