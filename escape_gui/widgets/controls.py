@@ -28,6 +28,7 @@ from PySide6.QtWidgets import (
 from escape_gui.client.availability import tooltip
 from escape_gui.theme import Theme
 from escape_hw.remote.state import DeviceHealth
+from escape_hw.report.verdict import Quality
 
 #: A widget or layout, one with its stretch factor, or ``None`` for stretchable space.
 Item: TypeAlias = QWidget | QLayout | tuple[QWidget | QLayout, int] | None
@@ -245,6 +246,11 @@ HEALTH_LEVELS: dict[DeviceHealth, Level] = {
     DeviceHealth.FAULT: Level.ERROR,
     DeviceHealth.CLOSED: Level.NEUTRAL,
 }
+
+
+QUALITY_LEVELS: dict[Quality, Level] = {
+    Quality.GOOD: Level.GOOD, Quality.USABLE: Level.WARNING, Quality.NOT_USABLE: Level.ERROR,
+}  # fmt: skip
 
 
 class StatusIndicator(QWidget):

@@ -7,8 +7,9 @@ from PySide6.QtGui import QResizeEvent
 from PySide6.QtWidgets import QFrame, QLabel, QSizePolicy, QWidget
 
 from escape_gui.theme import Theme
-from escape_gui.widgets.controls import Level, StatusIndicator, caption, flat_button, row
+from escape_gui.widgets.controls import QUALITY_LEVELS, Level, StatusIndicator, caption, flat_button, row
 from escape_hw.remote.state import Finish, State
+from escape_hw.report.verdict import assess
 
 #: Display time of a notification; errors stay until they are closed.
 DISPLAY_MS = 6000
@@ -115,5 +116,10 @@ class StateNotifier:
             self._bar.show_message(Level.ERROR, "Fault, mirror made safe", state.fault.reason)
         if state.last_run is not None and state.last_run != before.last_run:
             last = state.last_run
-            text = "\n".join(part for part in (last.message, last.folder) if part)
-            self._bar.show_message(_LEVELS[last.finish], f"{last.name} {last.finish.value}", text)
+            verdict = assess(last.document)
+            level = _LEVELS[last.finish]
+            if verdict is not None and last.finish is Finish.DONE:
+                level = QUALITY_LEVELS[verdict.quality]
+            parts = (last.message, "" if verdict is None else str(verdict), last.folder)
+            text = "\n".join(part for part in parts if part)
+            self._bar.show_message(level, f"{last.name} {last.finish.value}", text)
