@@ -149,6 +149,8 @@ def run(system: str, address: str, screenshot: Path | None, reset_settings: bool
     else:
         controller = WindowController(window, session, address, local_server)
     window.update_timer.start()
+    if screenshot is None:
+        window.fit_to_screen(window.screen().availableGeometry())
     window.show()
     try:
         with _close_on_signals(window):

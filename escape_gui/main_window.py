@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
-from PySide6.QtCore import QByteArray, Qt
+from PySide6.QtCore import QByteArray, QPoint, QRect, QSize, Qt, QTimer
 from PySide6.QtGui import QAction, QCloseEvent, QKeySequence
 from PySide6.QtWidgets import (
     QApplication,
@@ -44,6 +44,8 @@ from escape_hw.errors import StorageError
 log = logging.getLogger(__name__)
 #: Version of the dock arrangement that Qt stores; layouts of other versions are discarded.
 LAYOUT_VERSION = 3
+#: Room that is left for the frame of the window manager.
+_FRAME = QSize(8, 32)
 #: Workspace in which recorded runs are opened.
 REPLAY_WORKSPACE = "calibrate"
 
@@ -220,15 +222,24 @@ class MainWindow(QMainWindow):
         self.tabs.setCurrentIndex(WORKSPACES.index(self.workspace))
         self.setFocus()
 
+    def fit_to_screen(self, available: QRect) -> None:
+        """Make the window fit the available part of a screen, with its frame and its last line."""
+        self.resize(self.size().boundedTo(available.size() - _FRAME))
+        last = available.bottomRight() - QPoint(self.width(), self.height())
+        self.move(
+            max(available.left(), min(self.x(), last.x())), max(available.top(), min(self.y(), last.y()))
+        )
+
     def _apply_layout(self) -> None:
         stored = self._settings.layouts.get(self.workspace.name)
         docks: dict[str, QDockWidget] = dict(self.docks)
         size = self.size()
         if stored is None or not self.restoreState(_bytes(stored), LAYOUT_VERSION):
             arrange_docks(self, docks, self.workspace)
-        # The layout of a larger window must not enlarge this one.
         self.resize(size)
         hide_orphan_tab_bars(self, docks)
+        # The layout of a larger window must not enlarge this one when Qt calculates its least size later.
+        QTimer.singleShot(0, self, lambda: self.resize(self.size().boundedTo(size)))
         # Docks that were shown again lie above everything else.
         self.overlay.raise_()
 

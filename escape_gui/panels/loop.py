@@ -57,7 +57,7 @@ class LoopPanel(Panel):
         self.modes = caption()
         self.matrix = QComboBox()
         ignore_wheel_without_focus(self.matrix)
-        self.load_button = QPushButton("Load matrix…")
+        self.load_button = QPushButton("Load…")
         self.load_button.setToolTip("Load the matrix of another run, also of an earlier night, or of a file")
         self.gain = NumberBox(*LIMITS["gain"], step=0.05, decimals=4)
         self.leak = NumberBox(*LIMITS["leak"], step=0.005, decimals=4)
@@ -101,9 +101,10 @@ class LoopPanel(Panel):
             limits = f", {LIMITS[name][0]:g} to {LIMITS[name][1]:g}" if name in LIMITS else ""
             self.editors[name].setToolTip(f"{_TIPS[name]}{limits}")
             self.editors[name].setAccessibleName(f"{text} setpoint")
+        form.addWidget(self.load_button, 3, 0, Qt.AlignmentFlag.AlignLeft)
         form.setColumnStretch(2, 1)
         form.setColumnStretch(3, 1)
-        self.body.addLayout(row(self.loop_indicator, self.modes, None, self.load_button))
+        self.body.addLayout(row(self.loop_indicator, self.modes, None))
         self.body.addLayout(form)
         self.body.addLayout(row(self.check_button, self.apply_button, self.revert_button, None))
         self.body.addWidget(self.message)
@@ -270,6 +271,7 @@ class LoopPanel(Panel):
         for name, editor in self.editors.items():
             wide = name == "matrix"
             editor.setMaximumWidth(self.context.theme.pixels(360 if wide else 180))
+            editor.setMinimumWidth(self.context.theme.pixels(110))
             if not wide:
                 editor.setFont(mono)
         self._apply_message_colour()

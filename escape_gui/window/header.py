@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from PySide6.QtCore import Qt
-from PySide6.QtGui import QAction
-from PySide6.QtWidgets import QGridLayout, QHBoxLayout, QLabel, QPushButton, QWidget
+from collections.abc import Sequence
+
+from PySide6.QtCore import QSize, Qt
+from PySide6.QtGui import QAction, QResizeEvent
+from PySide6.QtWidgets import QHBoxLayout, QLabel, QPushButton, QSizePolicy, QWidget
 
 from escape_gui.client.availability import UNKNOWN_VALUE, has_frames, is_measured
 from escape_gui.panels.base import Context
@@ -59,6 +61,37 @@ class ConnectionBanner(QLabel):
         self.setStyleSheet(f"background: {back}; color: {front}; padding: 3px;")
 
 
+class _Conditions(QWidget):
+    """Pairs of widgets above each other; the last pairs are hidden where they have no room.
+
+    The safety buttons beside them stay visible at any width.
+    """
+
+    _SPACING_PX = 24
+
+    def __init__(self, pairs: Sequence[tuple[QWidget, QWidget]]) -> None:
+        super().__init__()
+        self._columns = []
+        for pair in pairs:
+            page = QWidget()
+            right = isinstance(pair[0], Readout)
+            column(*(row(None, one) if right else one for one in pair), parent=page, spacing=0)
+            self._columns.append(page)
+        row(*self._columns, None, parent=self, spacing=self._SPACING_PX)
+        self.setSizePolicy(QSizePolicy.Policy.Ignored, QSizePolicy.Policy.Preferred)
+
+    def minimumSizeHint(self) -> QSize:
+        return QSize(0, super().minimumSizeHint().height())
+
+    def resizeEvent(self, event: QResizeEvent) -> None:
+        super().resizeEvent(event)
+        used = 0
+        for one in self._columns:
+            used += one.sizeHint().width()
+            one.setVisible(used <= self.width())
+            used += self._SPACING_PX
+
+
 class HeaderBar(QWidget):
     """Connection banner, state of the system in two rows, and the safety buttons."""
 
@@ -83,18 +116,13 @@ class HeaderBar(QWidget):
         column(self.connection_banner, self._row(), parent=self, spacing=0)
 
     def _row(self) -> QHBoxLayout:
-        grid = QGridLayout()
-        grid.setHorizontalSpacing(24)
-        grid.setVerticalSpacing(0)
-        indicators = ((self.phase, self.loop), (self.saturation, self.control))
-        for k, pair in enumerate(indicators):
-            for line, widget in enumerate(pair):
-                grid.addWidget(widget, line, k)
-        pairs = (("rate", "lost"), ("rms", "peak"), ("latency", "jitter"))
-        for k, names in enumerate(pairs, len(indicators)):
-            for line, name in enumerate(names):
-                grid.addWidget(self.readouts[name], line, k, Qt.AlignmentFlag.AlignRight)
-        content = row(grid, None, self.open_button, self.flatten_button)
+        pairs: tuple[tuple[QWidget, QWidget], ...] = (
+            (self.phase, self.loop), (self.saturation, self.control),
+            (self.readouts["rate"], self.readouts["lost"]), (self.readouts["rms"], self.readouts["peak"]),
+            (self.readouts["latency"], self.readouts["jitter"]),
+        )  # fmt: skip
+        self.conditions = _Conditions(pairs)
+        content = row((self.conditions, 1), self.open_button, self.flatten_button)
         content.setContentsMargins(8, 4, 8, 4)
         return content
 

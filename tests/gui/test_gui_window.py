@@ -335,7 +335,9 @@ def test_nothing_of_the_header_is_cut_off(make_window: MakeWindow, scale: float)
     header = window.header
     for widget in (*header.readouts.values(), header.phase, header.loop, header.saturation, header.control):
         assert widget.width() >= widget.sizeHint().width()
-        assert widget.geometry().right() < header.open_button.geometry().left()
+        right = widget.mapTo(header, widget.rect().topRight()).x()
+        assert widget.isVisible()
+        assert right < header.open_button.geometry().left()
 
 
 def test_a_window_without_a_source_starts(tmp_path: Path) -> None:
