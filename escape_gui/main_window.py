@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import logging
 from collections.abc import Callable, Sequence
+from datetime import datetime
 from functools import partial
 from pathlib import Path
 
@@ -35,7 +36,7 @@ from escape_gui.window.actions import ACTIONS, MENUS, format_shortcuts, help_pag
 from escape_gui.window.closing import CloseQuestion, is_busy
 from escape_gui.window.docks import WORKSPACES, Dock, arrange_docks, hide_orphan_tab_bars, workspace
 from escape_gui.window.export import Exporter
-from escape_gui.window.header import ControlBanner, FaultBanner, HeaderBar
+from escape_gui.window.header import ControlBanner, FaultBanner, FrozenBanner, HeaderBar
 from escape_gui.window.notifications import NotificationBar, StateNotifier
 from escape_gui.window.run_browser import RunBrowser
 from escape_gui.window.update_timer import UpdateTimer
@@ -81,12 +82,13 @@ class MainWindow(QMainWindow):
             self.context, self.actions_by_name["open_loop"], self.actions_by_name["flatten"]
         )
         self.fault_banner = FaultBanner(self.context, self.actions_by_name["clear_fault"])
+        self.frozen_banner = FrozenBanner(self.context, self.actions_by_name["freeze"])
         self.control_banner = ControlBanner(self.context, self.actions_by_name["take_control"])
         self.tabs = self._make_tabs()
         self.panels = {kind.name: kind(self.context) for kind in panels}
         self.docks = {name: self._make_dock(panel) for name, panel in self.panels.items()}
         self._make_header()
-        self._status_labels = {name: QLabel() for name in ("frozen", "busy", "saved", "recording", "disk")}
+        self._status_labels = {name: QLabel() for name in ("busy", "saved", "recording", "disk")}
         self.notifications = NotificationBar(theme)
         self.statusBar().addWidget(self.notifications, 1)
         for label in self._status_labels.values():
@@ -210,7 +212,15 @@ class MainWindow(QMainWindow):
                     submenu.addAction(dock.toggleViewAction())
         bar.setCornerWidget(self.tabs, Qt.Corner.TopRightCorner)
         top = QWidget()
-        column(bar, self.header, self.fault_banner, self.control_banner, parent=top, spacing=0)
+        column(
+            bar,
+            self.header,
+            self.fault_banner,
+            self.control_banner,
+            self.frozen_banner,
+            parent=top,
+            spacing=0,
+        )
         self.setMenuWidget(top)
 
     # ------------------------------------------------------------ layout
@@ -284,6 +294,8 @@ class MainWindow(QMainWindow):
         session = self.context.session
         now = session.request_context
         state = now.state
+        if now.live:
+            session.history.update(state)
         self.header.show_state(state, connected=now.connected, live=now.live, mine=now.may_write)
         self.fault_banner.show_state(state)
         self.control_banner.show_state(state, offered=now.connected and now.live and not now.may_write)
@@ -327,7 +339,7 @@ class MainWindow(QMainWindow):
     def toggle_freeze(self) -> None:
         """Freeze the panels or resume them; header and safety buttons never freeze."""
         self.update_timer.frozen = not self.update_timer.frozen
-        self._set_status("frozen", "Panels frozen (X to resume)" if self.update_timer.frozen else "")
+        self.frozen_banner.show_frozen(f"{datetime.now():%H:%M:%S}" if self.update_timer.frozen else "")
 
     def toggle_keyboard_table(self) -> None:
         if self.overlay.isVisible():

@@ -12,6 +12,7 @@ from typing import TypeVar
 from PySide6.QtCore import QObject, Qt, Signal
 
 from escape_gui.client.availability import RequestContext
+from escape_gui.client.history import LoopHistory
 from escape_gui.client.product_library import ProductLibrary
 from escape_hw.errors import EscapeError
 from escape_hw.io.run_folder import default_runs_folder
@@ -63,6 +64,8 @@ class Session(QObject):
         self.source: DataSource = EmptySource()
         #: Receives the requests; ``None`` in replay and before a connection.
         self.control: Connection | None = None
+        #: Strehl ratio and residual over hours.
+        self.history = LoopHistory()
         #: Products listed by the source, loaded for the panels.
         self.library = ProductLibrary()
         self._executors: dict[bool, ThreadPoolExecutor] = {}

@@ -9,7 +9,7 @@ from typing import ClassVar
 from PySide6.QtCore import Qt
 from PySide6.QtWidgets import QComboBox, QGridLayout, QLabel, QPushButton
 
-from escape_gui.client.availability import is_measured, reason_no_write
+from escape_gui.client.availability import is_measured, reason_no_change, reason_no_start
 from escape_gui.panels.base import Context, Panel
 from escape_gui.views.loop_form import FIELDS, LIMITS, LoopSettingsEdit
 from escape_gui.widgets.controls import (
@@ -158,7 +158,7 @@ class LoopPanel(Panel):
 
     def tick(self, source: DataSource) -> None:
         now = self.context.session.request_context
-        reason = reason_no_write(now)
+        reason = reason_no_change(now)
         edit = self._checked_edit
         nothing = "press Check first" if edit is None else "" if edit.changed(self._loop) else "no changes"
         set_available(self.apply_button, "Change the loop now.", reason or nothing)
@@ -170,7 +170,8 @@ class LoopPanel(Panel):
             obstacle = f"{now.state.active_run.name} is running"
         else:
             obstacle = "press Check first" if self._edited and self._checked_edit is None else ""
-        set_available(self.close_button, "Close the loop with the values above.", reason or obstacle)
+        obstacle = reason_no_start(now) or obstacle
+        set_available(self.close_button, "Close the loop with the values above.", obstacle)
         self.closing_values.setText("" if obstacle else f"Closes with {self.edit.describe()}.")
         self.closing_values.setVisible(not obstacle)
 

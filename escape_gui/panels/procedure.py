@@ -13,9 +13,10 @@ from PySide6.QtWidgets import QComboBox, QGridLayout, QLabel, QProgressBar, QPus
 
 from escape_gui.client.availability import (
     reason_no_abort,
+    reason_no_engine,
     reason_no_pause,
     reason_no_request,
-    reason_no_write,
+    reason_no_start,
 )
 from escape_gui.panels.base import Context, Panel
 from escape_gui.views import procedure_form as form_text
@@ -264,8 +265,8 @@ class ProcedurePanel(Panel):
         busy = "a procedure is running" if now.state.active_run is not None else ""
         not_checked = "" if self._plan is not None else "the arguments are not checked yet"
         for button, tip, reason in (
-            (self.check, "Check the arguments and show the plan; nothing moves.", reason_no_request(now)),
-            (self.start, "Start the procedure.", reason_no_write(now) or busy or not_checked),
+            (self.check, "Check the arguments and show the plan; nothing moves.", reason_no_engine(now)),
+            (self.start, "Start the procedure.", reason_no_start(now) or busy or not_checked),
             (self.pause, "Pause between two steps, or resume.", reason_no_pause(now)),
             (self.abort, "Stop and save the data acquired so far.", reason_no_abort(now)),
         ):

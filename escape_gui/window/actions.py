@@ -15,12 +15,12 @@ from escape_gui.client.availability import (
     UnavailableReason,
     always_available,
     reason_no_abort,
+    reason_no_change,
     reason_no_clear_fault,
     reason_no_pause,
     reason_no_release,
     reason_no_request,
     reason_no_take_control,
-    reason_no_write,
 )
 from escape_gui.panels.base import Panel
 from escape_gui.window.docks import WORKSPACES
@@ -92,7 +92,7 @@ ACTIONS: tuple[Action, ...] = (
     Action("give_back", "&Loop", "Re&lease control", "Release control for other clients.",
            ("Ctrl+Shift+L",), reason_no_release),
     Action("record", "&Loop", "&Record telemetry", "Start or stop recording every frame to disk.",
-           ("Ctrl+R",), reason_no_write),
+           ("Ctrl+R",), reason_no_change),
     Action("clear_fault", "&Loop", "&Clear fault", "Clear the latched fault and enable the mirror.",
            (), reason_no_clear_fault),
     Action("help_panel", "&Help", "This &panel", "Help on the panel with the focus.", ("F1",)),

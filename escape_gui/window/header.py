@@ -8,7 +8,7 @@ from PySide6.QtCore import QSize, Qt
 from PySide6.QtGui import QAction, QResizeEvent
 from PySide6.QtWidgets import QHBoxLayout, QLabel, QPushButton, QSizePolicy, QWidget
 
-from escape_gui.client.availability import UNKNOWN_VALUE, has_frames, is_measured
+from escape_gui.client.availability import UNKNOWN_VALUE, has_engine, has_frames, is_measured
 from escape_gui.panels.base import Context
 from escape_gui.widgets.controls import HoldButton, Level, Readout, StatusIndicator, column, row, text_label
 from escape_hw.remote.state import Phase, State
@@ -143,7 +143,7 @@ class HeaderBar(QWidget):
             "jitter": f"{latency.jitter_p99:.0f}" if latency.p99 else UNKNOWN_VALUE,
         }
         for name, text in values.items():
-            self.readouts[name].show_value(text if known else UNKNOWN_VALUE)
+            self.readouts[name].show_value(text if known and has_engine(state) else UNKNOWN_VALUE)
 
     def _show_conditions(self, state: State, *, known: bool) -> None:
         if known:
@@ -179,11 +179,17 @@ class HeaderBar(QWidget):
 
 def _safety_button(action: QAction, text: str) -> QPushButton:
     """A button that triggers an action but keeps its own text and is always visible."""
-    button = QPushButton(text)
+    button = _action_button(text, action)
     button.setObjectName("stop")
     button.setAccessibleName(text)
-    button.clicked.connect(action.trigger)
     button.setMinimumHeight(40)
+    return button
+
+
+def _action_button(text: str, action: QAction) -> QPushButton:
+    """A button that triggers an action."""
+    button = QPushButton(text)
+    button.clicked.connect(action.trigger)
     _follow_action(button, action)
     return button
 
@@ -221,46 +227,61 @@ def control_offer(state: State) -> str:
     return f"{text} is aborted in {max(0.0, state.unattended_limit_s - state.unattended_for_s):.0f} s"
 
 
-class ControlBanner(QWidget):
-    """A row below the header that offers control with a button, visible while nobody uses it."""
+class Banner(QWidget):
+    """A row below the header with a word, a text and a button; visible while there is a text."""
 
-    def __init__(self, context: Context, take_control: QAction) -> None:
+    def __init__(self, context: Context, level: Level, word: str, button: QPushButton) -> None:
         super().__init__()
-        self._indicator = StatusIndicator(context.theme)
-        self._indicator.set_status(Level.WARNING, "CONTROL")
-        self.text = text_label()
-        self.button = QPushButton("Take control")
-        self.button.clicked.connect(take_control.trigger)
-        _follow_action(self.button, take_control)
-        row(self._indicator, (self.text, 1), self.button, parent=self).setContentsMargins(8, 4, 8, 4)
+        indicator = StatusIndicator(context.theme)
+        indicator.set_status(level, word)
+        self.text, self.button = text_label(), button
+        row(indicator, (self.text, 1), button, parent=self).setContentsMargins(8, 4, 8, 4)
         self.hide()
 
-    def show_state(self, state: State, *, offered: bool) -> None:
-        """Show or hide the row; ``offered``: this window can take control and does not have it."""
-        text = control_offer(state) if offered and is_measured(state) else ""
-        self.text.setText(text)
+    def show_text(self, text: str) -> None:
+        """Show the row, or hide it if the text is empty."""
+        if text != self.text.text():
+            self.text.setText(text)
+        # After the text was set: the height depends on it.
         self.setVisible(bool(text))
 
 
-class FaultBanner(QWidget):
-    """A row below the header, visible during a fault, with a button for the action that clears it."""
+class ControlBanner(Banner):
+    """Offers control with a button while nobody uses it."""
+
+    def __init__(self, context: Context, take_control: QAction) -> None:
+        super().__init__(context, Level.WARNING, "CONTROL", _action_button("Take control", take_control))
+
+    def show_state(self, state: State, *, offered: bool) -> None:
+        """Show or hide the row; ``offered``: this window can take control and does not have it."""
+        self.show_text(control_offer(state) if offered and is_measured(state) else "")
+
+
+class FrozenBanner(Banner):
+    """Shows that the panels do not follow the data."""
+
+    def __init__(self, context: Context, freeze: QAction) -> None:
+        super().__init__(context, Level.WARNING, "FROZEN", _action_button("Resume (X)", freeze))
+
+    def show_frozen(self, since: str) -> None:
+        """Show the time since when the panels are frozen; empty: they are not."""
+        self.show_text(f"The panels show the data of {since}. The rows above are live." if since else "")
+
+
+class FaultBanner(Banner):
+    """Shows a fault, with a button for the action that clears it."""
 
     def __init__(self, context: Context, clear: QAction) -> None:
-        super().__init__()
-        indicator = StatusIndicator(context.theme)
-        indicator.set_status(Level.ERROR, "FAULT")
-        self._text = text_label()
         button = HoldButton("clear", context.theme)
         button.confirmed.connect(clear.trigger)
         _follow_action(button, clear)
-        row(indicator, (self._text, 1), button, parent=self).setContentsMargins(8, 4, 8, 4)
-        self.hide()
+        super().__init__(context, Level.ERROR, "FAULT", button)
 
     def show_state(self, state: State) -> None:
         """Show the fault, or hide the row if there is none."""
         fault = state.fault
-        if fault is not None:
-            text = f"{fault.reason} · {fault.at_utc}"
-            self._text.setText(f"{text}\n{fault.remedy}" if fault.remedy else text)
-        # After the text was set: the height depends on it.
-        self.setVisible(fault is not None)
+        if fault is None:
+            self.show_text("")
+            return
+        text = f"{fault.reason} · {fault.at_utc}"
+        self.show_text(f"{text}\n{fault.remedy}" if fault.remedy else text)

@@ -56,6 +56,11 @@ class NotificationBar(QWidget):
         theme.changed.connect(lambda: self.setMinimumHeight(theme.pixels(26)))
         self._show_newest()
 
+    def close_messages(self, title: str) -> None:
+        """Remove the notifications of this title: their reason has passed."""
+        for one in [one for one in self.notifications if one.title == title]:
+            self._remove(one)
+
     def show_message(self, level: Level, title: str, text: str, *, persistent: bool | None = None) -> None:
         """Show a notification for :data:`DISPLAY_MS`; if ``persistent`` (default: errors), until closed."""
         while len(self.notifications) >= _MAX_NOTIFICATIONS:
@@ -87,6 +92,8 @@ class NotificationBar(QWidget):
         self._more.setToolTip("Older notifications" if others > 0 else "")
 
 
+#: Titles of notifications that are closed when their reason has passed.
+_LOST, _FAULT = "Server lost", "Fault, mirror made safe"
 _LEVELS = {Finish.DONE: Level.GOOD, Finish.ABORTED: Level.WARNING, Finish.FAILED: Level.ERROR}
 
 
@@ -104,16 +111,19 @@ class StateNotifier:
         self._state, self._connected = state, connected
         if was_connected and not connected:
             why = "Connection lost; reconnecting automatically."
-            self._bar.show_message(Level.ERROR, "Server lost", why, persistent=False)
+            self._bar.show_message(Level.ERROR, _LOST, why)
         if not connected:
             return
+        self._bar.close_messages(_LOST)
+        if state.fault is None:
+            self._bar.close_messages(_FAULT)
         if before is None or not was_connected:
             for notice in state.notes:
                 self._bar.show_message(Level.WARNING, "Startup notice", notice)
         if before is None:
             return
         if state.fault is not None and state.fault != before.fault:
-            self._bar.show_message(Level.ERROR, "Fault, mirror made safe", state.fault.reason)
+            self._bar.show_message(Level.ERROR, _FAULT, state.fault.reason)
         if state.last_run is not None and state.last_run != before.last_run:
             last = state.last_run
             verdict = assess(last.document)

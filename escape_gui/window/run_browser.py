@@ -19,7 +19,7 @@ from PySide6.QtWidgets import (
     QWidget,
 )
 
-from escape_gui.client.availability import reason_no_write
+from escape_gui.client.availability import reason_no_change
 from escape_gui.client.session import Session, runs_folder
 from escape_gui.views.run_list import COLUMNS, RunSummary, read_runs
 from escape_gui.widgets.controls import column, row, set_available, text_label
@@ -139,7 +139,7 @@ class RunBrowser(QDialog):
         return self._run(line) if chosen else None
 
     def _enable(self) -> None:
-        run, why = self.selected, reason_no_write(self._session.request_context)
+        run, why = self.selected, reason_no_change(self._session.request_context)
         choose = "" if run is not None else "select a run"
         no_matrix = "this run has no matrix" if run is not None and run.matrix is None else ""
         tip = "Add the matrix of this run to those that the loop can use; the loop does not change."

@@ -13,6 +13,7 @@ from PySide6.QtGui import QGuiApplication
 from pytestqt.qtbot import QtBot
 from scripted import DEVICES, ScriptedSource, running, secondary
 
+from escape_gui.client.history import LoopHistory
 from escape_gui.client.session import Session
 from escape_gui.main_window import MainWindow
 from escape_gui.panels import PANELS
@@ -30,6 +31,7 @@ from escape_hw.remote.state import (
     Illumination,
     LoopState,
     MirrorState,
+    Phase,
     State,
     StreamEntry,
 )
@@ -177,26 +179,54 @@ def test_log_search_level_and_copy(window: MainWindow, source: ScriptedSource) -
     assert "message 4" in QGuiApplication.clipboard().text()
 
 
-def test_performance_has_gaps_while_hidden(window: MainWindow, source: ScriptedSource) -> None:
+def test_performance_goes_on_while_the_panel_is_hidden(window: MainWindow, source: ScriptedSource) -> None:
     panel = panel_of(window, PerformancePanel)
-    panel._last_state_s -= 60.0
-    source.change(loop=source.state.loop.model_copy(update={"residual_nm": 50.0}))
-    window.update_timer.tick(force=True)
+    window.show_workspace("align")
+    for residual in (50.0, 51.0):
+        source.change(loop=source.state.loop.model_copy(update={"residual_nm": residual}))
+        window.update_timer.tick(force=True)
+    window.show_workspace("operate")
     (table,) = panel.export_arrays()
-    assert np.isnan(table.data[-2, 1:]).all()
-    assert table.data[-1, 2] == 50.0
+    assert table.data[-3:, 2].tolist() == [44.0, 50.0, 51.0]
 
 
-def test_performance_has_gaps_where_the_loop_was_open(
-    window: MainWindow, source: ScriptedSource, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("escape_gui.panels.performance._GAP_S", np.inf)
+def test_performance_has_gaps_where_the_loop_was_open(window: MainWindow, source: ScriptedSource) -> None:
     panel = panel_of(window, PerformancePanel)
     source.change(loop=source.state.loop.model_copy(update={"closed": False}))
     window.update_timer.tick(force=True)
     (table,) = panel.export_arrays()
     assert table.data[-2, 1:] == pytest.approx([36.5, 44.0])
     assert np.isnan(table.data[-1, 1:]).all()
+
+
+def test_performance_survives_the_end_of_the_engine(window: MainWindow, source: ScriptedSource) -> None:
+    panel = panel_of(window, PerformancePanel)
+    source.fail("the engine died")
+    source.change(engine_pid=0)
+    window.update_timer.tick(force=True)
+    source.change(engine_pid=12, fault=None, phase=Phase.IDLE)
+    window.update_timer.tick(force=True)
+    assert not panel.shows_placeholder
+    (table,) = panel.export_arrays()
+    assert table.data[1, 1:] == pytest.approx([36.5, 44.0])
+
+
+def test_hours_of_performance_need_little_memory_and_are_shown_in_hours(
+    window: MainWindow, source: ScriptedSource
+) -> None:
+    seconds = iter(np.arange(0, 9 * 3600, 0.2))
+    history = LoopHistory(clock=lambda: float(next(seconds)))
+    loop = source.state.loop
+    for serial in range(9 * 3600 * 5):
+        history.update(State.model_construct(system="a", server_pid=1, serial=serial + 1, loop=loop))
+    times, _ = history.strehl.arrays
+    assert times.size >= 8 * 3600 * 5
+    assert sum(one.nbytes for one in vars(history.strehl).values() if hasattr(one, "nbytes")) < 10e6
+    panel = panel_of(window, PerformancePanel)
+    panel.span.choose("12 h")
+    panel.strehl.show_history(history.strehl, times[-1])
+    assert panel.strehl.getPlotItem().getAxis("bottom").labelText == "time before now [h]"
+    assert panel.strehl._line.getData()[0].size < 10_000
 
 
 def test_profiles_begin_at_the_strehl_ratio(make_window: MakeWindow, source: ScriptedSource) -> None:

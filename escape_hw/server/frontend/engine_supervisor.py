@@ -13,7 +13,15 @@ from pydantic import ValidationError
 from escape_hw.config.system import ServerSection
 from escape_hw.errors import EscapeError
 from escape_hw.io.provenance import format_utc
-from escape_hw.remote.state import FaultState, Phase, State
+from escape_hw.remote.state import (
+    DeviceHealth,
+    FaultState,
+    FrameCounters,
+    Illumination,
+    LatencyState,
+    Phase,
+    State,
+)
 from escape_hw.server.frontend.engine_process import STOP_TIMEOUT_S, EngineProcess
 from escape_hw.server.frontend.lease import LeaseManager
 from escape_hw.server.frontend.transport import ZmqTransport
@@ -209,10 +217,14 @@ class EngineSupervisor:
         """Publish that there is no engine, and why."""
         log.error("FAULT: %s", reason)
         state = self._published.state
+        lost = {"health": DeviceHealth.LOST, "facts": {}, "message": "the engine has ended"}
+        devices = tuple(one.model_copy(update=lost) for one in state.devices)
         self._published.update(
             state.model_copy(
                 update={
-                    "phase": Phase.FAULT, "active_run": None, "streams": (), "engine_pid": 0,
+                    "devices": devices, "rates": FrameCounters(), "illumination": Illumination(),
+                    "latency": LatencyState(), "phase": Phase.FAULT, "active_run": None, "streams": (),
+                    "engine_pid": 0,
                     "fault": FaultState(reason=reason, at_utc=format_utc(), remedy=_RESTART_REMEDY),
                     "loop": state.loop.model_copy(update={"closed": False}),
                 }
