@@ -41,12 +41,15 @@ from escape_gui.window.notifications import NotificationBar, StateNotifier
 from escape_gui.window.run_browser import RunBrowser
 from escape_gui.window.update_timer import UpdateTimer
 from escape_hw.errors import StorageError
+from escape_hw.remote.state import State
 
 log = logging.getLogger(__name__)
 #: Version of the dock arrangement that Qt stores; layouts of other versions are discarded.
 LAYOUT_VERSION = 3
 #: Room that is left for the frame of the window manager.
 _FRAME = QSize(8, 32)
+#: Width of the coloured frame of a recorded run, and offset of its window, pixels.
+_REPLAY_FRAME_PX, _REPLAY_OFFSET_PX = 5, 64
 #: Workspace in which recorded runs are opened.
 REPLAY_WORKSPACE = "calibrate"
 
@@ -316,7 +319,21 @@ class MainWindow(QMainWindow):
             else "",
         )
         self._set_status("disk", f"{state.disk.free_gb:.1f} GB free" if state.disk.folder else "")
-        self.setWindowTitle(f"ESCAPE · {state.system}" if state.system else "ESCAPE")
+        self._show_source(state)
+
+    def _show_source(self, state: State) -> None:
+        """Title, and for a recorded run a frame in the colour of the banner."""
+        source = self.context.session.source
+        replay = isinstance(source, ReplaySource)
+        if replay:
+            title = f"REPLAY · {source.path.name} · ESCAPE"
+        else:
+            title = f"ESCAPE · {state.system}" if state.system else "ESCAPE"
+        self.setWindowTitle(title)
+        frame = f"MainWindow {{ background: {self.context.theme.colours.replay}; }}" if replay else ""
+        if frame != self.styleSheet():
+            self.setStyleSheet(frame)
+            self.setContentsMargins(*(4 * [_REPLAY_FRAME_PX if replay else 0]))
 
     def _set_status(self, name: str, text: str) -> None:
         self._status_labels[name].setText(text)
@@ -369,8 +386,10 @@ class MainWindow(QMainWindow):
         other = MainWindow(Session(), self._settings.model_copy(deep=True), None, kinds)
         self.replay_windows.append(other)
         other.show_recording(source)
-        other.setWindowTitle(f"ESCAPE · {source.path.name}")
         other.update_timer.start()
+        # The bench stays visible beside the recorded run.
+        other.resize(0.85 * self.size())
+        other.move(self.pos() + QPoint(_REPLAY_OFFSET_PX, _REPLAY_OFFSET_PX))
         other.show()
 
     def close_without_question(self) -> None:

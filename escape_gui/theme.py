@@ -42,6 +42,8 @@ class Palette:
     on_simulated: str
     hardware: str
     on_hardware: str
+    replay: str
+    on_replay: str
     #: Safety buttons.
     stop: str
     on_stop: str
@@ -55,6 +57,7 @@ DARK = Palette(
     line="#353b41", text="#e4e7ea", muted="#9aa4ad", accent="#56b4e9", on_accent="#06141d",
     good="#3fc79a", warn="#f0b429", bad="#ff7a6b",
     simulated="#1f3d52", on_simulated="#d6edfb", hardware="#e69f00", on_hardware="#171000",
+    replay="#6d3fa0", on_replay="#ffffff",
     stop="#b3261e", on_stop="#ffffff",
     series=("#56b4e9", "#e69f00", "#2bbf94", "#e08fbb", "#f0e442", "#ff8f4d"),
 )
@@ -63,6 +66,7 @@ LIGHT = Palette(
     line="#b9c0c7", text="#15191d", muted="#4d5760", accent="#005f9e", on_accent="#ffffff",
     good="#00634a", warn="#7d4e00", bad="#b3261e",
     simulated="#cfe5f4", on_simulated="#0b3550", hardware="#ffc04d", on_hardware="#241800",
+    replay="#6d3fa0", on_replay="#ffffff",
     stop="#b3261e", on_stop="#ffffff",
     series=("#0072b2", "#b85c00", "#00795a", "#a84a82", "#7a6f00", "#444c54"),
 )

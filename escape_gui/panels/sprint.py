@@ -85,6 +85,8 @@ class SprintPanel(Panel):
         """Take convergence and warnings from the result of a run that fitted or tracked a registration."""
         self._running = state.active_run is not None
         last = state.last_run
+        if self._running:
+            self._last_result_id = -1
         if last is None or last.id == self._last_result_id or self._running:
             return
         self._last_result_id = last.id

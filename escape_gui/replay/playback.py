@@ -76,8 +76,8 @@ def is_recording(path: Path) -> bool:
     return path.is_dir() or path.suffix.lower() == ".fits"
 
 
-#: Number of steps of the slider, and duration of each in playback.
-_STEPS, _STEP_MS = 60, 150
+#: Largest number of steps of the slider, and duration of each in playback.
+_MAX_STEPS, _STEP_MS = 600, 150
 
 
 class PlaybackBar(QToolBar):
@@ -90,7 +90,6 @@ class PlaybackBar(QToolBar):
         self._session = session
         self._name_label = QLabel()
         self.slider = QSlider(Qt.Orientation.Horizontal)
-        self.slider.setRange(0, _STEPS)
         self.slider.setAccessibleName("Position in the recorded run")
         self.slider.setToolTip("Position in the run: iterations, rounds, seconds of tracking.")
         self.slider.valueChanged.connect(self._seek)
@@ -99,7 +98,8 @@ class PlaybackBar(QToolBar):
         self.play.setCheckable(True)
         self.play.setToolTip("Play the run step by step.")
         self.play.toggled.connect(self._on_play_toggled)
-        for widget in (self._name_label, self.play, self.slider):
+        self.position_label = QLabel()
+        for widget in (self._name_label, self.play, self.slider, self.position_label):
             self.addWidget(widget)
         self._timer = QTimer(self)
         self._timer.setInterval(_STEP_MS)
@@ -118,20 +118,27 @@ class PlaybackBar(QToolBar):
         self.play.setChecked(False)
         self.setVisible(recording is not None and recording.steps > 1)
         if recording is not None:
-            self._name_label.setText(f"{recording.path.name}  ")
-            self.slider.setValue(_STEPS)
+            self._name_label.setText(f"REPLAY of {recording.path.name}  ")
+            self.slider.setRange(1, min(recording.steps, _MAX_STEPS))
+            self.slider.setValue(self.slider.maximum())
+            self._show_position()
 
     def _seek(self, value: int) -> None:
         if (recording := self.recording) is not None:
-            recording.seek(value / _STEPS)
+            recording.seek(value / self.slider.maximum())
+            self._show_position()
+
+    def _show_position(self) -> None:
+        if (recording := self.recording) is not None:
+            self.position_label.setText(f"  step {recording.step} of {recording.steps}  ")
 
     def _on_play_toggled(self, on: bool) -> None:
         self.play.setText("⏸ Pause" if on else "▶ Play")
-        if on and self.slider.value() == _STEPS:
-            self.slider.setValue(0)
+        if on and self.slider.value() == self.slider.maximum():
+            self.slider.setValue(1)
         (self._timer.start if on else self._timer.stop)()
 
     def _step(self) -> None:
         self.slider.setValue(self.slider.value() + 1)
-        if self.slider.value() == _STEPS:
+        if self.slider.value() == self.slider.maximum():
             self.play.setChecked(False)

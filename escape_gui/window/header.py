@@ -42,7 +42,7 @@ class ConnectionBanner(QLabel):
         if not connected and not is_measured(state):
             text, keys = NOT_CONNECTED_TEXT, ("button", "text")
         elif not live:
-            text, keys = f"REPLAY · {state.system}", ("button", "text")
+            text, keys = f"REPLAY OF A RECORDED RUN · {state.system} · NOT THE BENCH", ("replay", "on_replay")
         elif not connected:
             text, keys = "NOT CONNECTED · values below are stale", ("stop", "on_stop")
         elif state.simulated:
@@ -130,6 +130,8 @@ class HeaderBar(QWidget):
         """Update everything; ``mine``: this client holds the lease."""
         self.connection_banner.show_state(state, connected=connected, live=live)
         known = live and is_measured(state)
+        for button in (self.open_button, self.flatten_button):
+            button.setVisible(live)
         self._show_conditions(state, known=known)
         self._show_control(state, replay=connected and not live, mine=mine)
         latency = state.latency
