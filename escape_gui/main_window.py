@@ -215,6 +215,8 @@ class MainWindow(QMainWindow):
                     submenu.addAction(dock.toggleViewAction())
         bar.setCornerWidget(self.tabs, Qt.Corner.TopRightCorner)
         top = QWidget()
+        top.setObjectName("header")
+        top.setAttribute(Qt.WidgetAttribute.WA_StyledBackground)
         column(
             bar,
             self.header,
@@ -324,8 +326,7 @@ class MainWindow(QMainWindow):
     def _show_source(self, state: State) -> None:
         """Title, and for a recorded run a frame in the colour of the banner."""
         source = self.context.session.source
-        replay = isinstance(source, ReplaySource)
-        if replay:
+        if replay := isinstance(source, ReplaySource):
             title = f"REPLAY · {source.path.name} · ESCAPE"
         else:
             title = f"ESCAPE · {state.system}" if state.system else "ESCAPE"
@@ -388,7 +389,7 @@ class MainWindow(QMainWindow):
         other.show_recording(source)
         other.update_timer.start()
         # The bench stays visible beside the recorded run.
-        other.resize(0.85 * self.size())
+        other.resize(round(0.85 * self.width()), round(0.85 * self.height()))
         other.move(self.pos() + QPoint(_REPLAY_OFFSET_PX, _REPLAY_OFFSET_PX))
         other.show()
 

@@ -239,6 +239,7 @@ QScrollBar::handle { background: @line; border-radius: 4px; min-height: 24px; mi
 QScrollBar::add-line, QScrollBar::sub-line { width: 0; height: 0; }
 QScrollBar::add-page, QScrollBar::sub-page { background: transparent; }
 #panel { background: @panel; }
+#header { background: @window; }
 #title { background: @panel; border-bottom: 1px solid @line; }
 #caption { color: @muted; }
 #empty { color: @muted; }

@@ -7,7 +7,7 @@ from functools import partial
 from typing import ClassVar
 
 from PySide6.QtCore import Qt
-from PySide6.QtWidgets import QComboBox, QGridLayout, QLabel, QPushButton
+from PySide6.QtWidgets import QComboBox, QGridLayout, QLabel, QPushButton, QWidget
 
 from escape_gui.client.availability import is_measured, reason_no_change, reason_no_start
 from escape_gui.panels.base import Context, Panel
@@ -62,9 +62,8 @@ class LoopPanel(Panel):
         self.gain = NumberBox(*LIMITS["gain"], step=0.05, decimals=4)
         self.leak = NumberBox(*LIMITS["leak"], step=0.005, decimals=4)
         self.dropped_modes = NumberBox(*LIMITS["dropped_modes"], step=1, decimals=0)
-        self.editors = {
-            "matrix": self.matrix, "gain": self.gain, "leak": self.leak, "dropped_modes": self.dropped_modes,
-        }  # fmt: skip
+        self.numbers = {"gain": self.gain, "leak": self.leak, "dropped_modes": self.dropped_modes}
+        self.editors: dict[str, QWidget] = {"matrix": self.matrix, **self.numbers}
         self.current = {name: QLabel("–") for name in FIELDS}
         self.check_button = QPushButton("Check")
         self.apply_button = QPushButton("Apply")
@@ -114,9 +113,9 @@ class LoopPanel(Panel):
 
     def _connect_signals(self) -> None:
         self.matrix.activated.connect(partial(self._on_edit, "matrix"))
-        for name in LIMITS:
-            self.editors[name].edited.connect(partial(self._on_edit, name))
-            self.editors[name].lineEdit().returnPressed.connect(self.check)
+        for name, field in self.numbers.items():
+            field.edited.connect(partial(self._on_edit, name))
+            field.lineEdit().returnPressed.connect(self.check)
         self.check_button.clicked.connect(self.check)
         self.apply_button.clicked.connect(self.apply)
         self.revert_button.clicked.connect(self._revert)
@@ -202,8 +201,8 @@ class LoopPanel(Panel):
         loop = self._loop
         if "matrix" not in self._edited and loop.matrix in self._matrices:
             self.matrix.setCurrentText(loop.matrix)
-        for name in LIMITS.keys() - self._edited:
-            self.editors[name].setValue(getattr(loop, name))
+        for name in self.numbers.keys() - self._edited:
+            self.numbers[name].setValue(getattr(loop, name))
 
     def _revert(self) -> None:
         self.clear()

@@ -158,10 +158,10 @@ class ProcedurePanel(Panel):
         _set_text(self.progress, "" if running is None else form_text.progress_line(running))
         _set_text(self._metrics, "" if running is None else self._metrics_text(running.metrics))
         self.pause.setText("Resume" if running is not None and running.paused else "Pause")
-        # Hidden during a run, to leave more room for the form.
-        self._result_area.setVisible(self._ended is not None and running is None)
         if state.last_run is not None and (self._ended is None or state.last_run.id != self._ended.id):
             self._show_ended(state.last_run)
+        # Hidden during a run, to leave more room for the form.
+        self._result_area.setVisible(self._ended is not None and running is None)
 
     def on_sample(self, stream: str, sample: Sample) -> None:
         self._matrix[stream] = sample.data
@@ -185,7 +185,6 @@ class ProcedurePanel(Panel):
         _set_text(self.numbers, "\n".join(form_text.comparison_lines(ended.document, before)))
         self.report.setVisible(bool(self._product("report")))
         self.folder.setVisible(bool(ended.folder))
-        self._result_area.show()
 
     def _product(self, name: str) -> str:
         return self._ended.products.get(name, "") if self._ended is not None else ""

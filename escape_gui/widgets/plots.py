@@ -372,6 +372,8 @@ class ConvergencePlot(_ParameterGrid):
         self._curves: dict[int, ErrorCurve] = {}
         top = self._add_row(0, "Step norm", "", "")
         top.setLogMode(y=True)
+        # In a low plot the labels between two decades overlap.
+        top.getAxis("left").setStyle(maxTextLevel=0)
         self._norm = ErrorCurve(self._theme, 0)
         self._norm.add_to(top)
         groups = GROUPS if self.physical else (("Normalised", "", tuple(range(len(NAMES)))),)

@@ -51,7 +51,7 @@ class RunBrowser(QDialog):
 
     def __init__(self, window: QWidget, session: Session) -> None:
         super().__init__(window)
-        self._session = session
+        self._window, self._session = window, session
         self.setWindowTitle("Runs and matrices")
         self.filter = QLineEdit()
         self.filter.setPlaceholderText("Filter: words of date, run, system, method, quality")
@@ -98,7 +98,7 @@ class RunBrowser(QDialog):
         self.verdict.setText("Reading the run folder…")
         future = self._pool.submit(lambda folder: list(read_runs(folder)), runs_folder(self._session))
         future.add_done_callback(self._listed.emit)
-        window = self.parentWidget()
+        window = self._window
         self.resize(min(1000, window.width() - 32), min(560, window.height() - 64))
         self.show()
         self.raise_()
@@ -110,9 +110,10 @@ class RunBrowser(QDialog):
         self.table.setRowCount(len(runs))
         for line, run in enumerate(runs):
             quality = -1 if run.quality is None else run.quality
+            values: tuple[float | str, ...]
             values = (run.date, run.name, run.system, run.method, run.frames, quality, run.size_mb)
-            for k, (text, value) in enumerate(zip(run.cells, values, strict=True)):
-                cell = _Cell(text, value)
+            for k, text in enumerate(run.cells):
+                cell = _Cell(text, values[k])
                 cell.setData(_SUMMARY, run)
                 cell.setToolTip(run.verdict)
                 self.table.setItem(line, k, cell)

@@ -76,13 +76,11 @@ def _noisy_modes(document: Mapping[str, Any]) -> Iterator[Verdict]:
     is_fitted = document.get("converged") is not None
     quality = Quality.USABLE if worst >= USABLE_SNR or is_fitted else Quality.NOT_USABLE
     frames = document.get("frames")
-    # The signal-to-noise ratio grows with the square root of the number of frames.
-    more = f"measure about {math.ceil(frames * (GOOD_SNR / max(worst, 0.1)) ** 2):,} frames" if frames else ""
-    yield Verdict(
-        quality,
-        f"SNR {worst:.2g} in the worst mode",
-        f"{more or 'measure more frames'} or drop the noisy modes",
-    )
+    # The signal-to-noise ratio grows with the square root of the number of frames; two digits are enough.
+    more = "measure more frames"
+    if frames:
+        more = f"measure about {float(f'{frames * (GOOD_SNR / max(worst, 0.1)) ** 2:.1e}'):,.0f} frames"
+    yield Verdict(quality, f"SNR {worst:.2g} in the worst mode", f"{more} or drop the noisy modes")
 
 
 def _figures(document: Mapping[str, Any]) -> Iterator[str]:

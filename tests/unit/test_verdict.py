@@ -16,11 +16,11 @@ ESCAPE = {"converged": True, "iterations": 15, "frames": 600, "snr": {"min": 23.
         (
             {"snr": {"min": 0.35}},
             Quality.USABLE,
-            "Usable: SNR 0.35 in the worst mode; measure about 44,082 frames",
+            "Usable: SNR 0.35 in the worst mode; measure about 44,000 frames",
         ),
         ({"converged": False}, Quality.NOT_USABLE, "Not usable: not converged"),
         ({"converged": None, "snr": {"min": 0.35}}, Quality.NOT_USABLE, "SNR 0.35 in the worst mode"),
-        ({"converged": None, "snr": {"min": 2.0}}, Quality.USABLE, "measure about 1,350 frames"),
+        ({"converged": None, "snr": {"min": 2.0}}, Quality.USABLE, "measure about 1,400 frames"),
         ({"criteria": [{"text": "loop stable", "met": False}]}, Quality.NOT_USABLE, "not met: loop stable"),
         ({"warnings": ["scaling beyond 5 %"]}, Quality.USABLE, "scaling beyond 5 %; see the report"),
         ({"partial": True}, Quality.USABLE, "aborted"),
