@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes.util
 import logging
 import os
 import signal
@@ -27,6 +26,7 @@ from escape_hw.config.loader import load_system
 from escape_hw.errors import ConfigError
 from escape_hw.remote.address import find_server, running_servers
 from escape_hw.remote.state import Phase
+from escape_hw.runtime.host.doctor import missing_qt_libraries
 
 log = logging.getLogger(__name__)
 #: System to serve if none is named and no server runs.
@@ -51,8 +51,8 @@ def require_display() -> None:
         raise ConfigError(
             "no display: log in with 'ssh -X', or set QT_QPA_PLATFORM=offscreen for --screenshot without one"
         )
-    if ctypes.util.find_library("xcb-cursor") is None:
-        raise ConfigError("Qt needs the library libxcb-cursor: install it with 'apt install libxcb-cursor0'")
+    if missing := missing_qt_libraries():
+        raise ConfigError(f"Qt needs libraries for the display: 'apt install {' '.join(missing)}'")
 
 
 def qt_application() -> QApplication:

@@ -135,7 +135,7 @@ def worst_mode(snr: np.ndarray[Any, np.dtype[np.float64]]) -> str:
 
 def result_line(ended: FinishedRun) -> str:
     """How a procedure ended, in one line."""
-    word = {Finish.DONE: "Done", Finish.ABORTED: "Aborted, acquired data saved", Finish.FAILED: "Failed"}
+    word = {Finish.DONE: "Done", Finish.ABORTED: "Aborted", Finish.FAILED: "Failed"}
     return f"{word[ended.finish]}: {ended.name}" + (f". {ended.message}" if ended.message else "")
 
 

@@ -200,13 +200,20 @@ class Readout(QWidget):
         self._theme, self._name, self._unit, self._digits = theme, name, unit, digits
         self._value = QLabel("–")
         self._value.setAlignment(Qt.AlignmentFlag.AlignRight | Qt.AlignmentFlag.AlignVCenter)
-        row(caption(name), self._value, caption(unit), parent=self, spacing=4)
+        self._caption = caption(name)
+        row(self._caption, self._value, caption(unit), parent=self, spacing=4)
         self.setSizePolicy(QSizePolicy.Policy.Maximum, QSizePolicy.Policy.Fixed)
         theme.follow(self._apply_theme)
 
     @property
     def text(self) -> str:
         return self._value.text()
+
+    def set_name(self, name: str) -> None:
+        """Change the caption."""
+        if name != self._name:
+            self._name = name
+            self._caption.setText(name)
 
     def show_value(self, text: str) -> None:
         if text != self._value.text():

@@ -105,7 +105,7 @@ ACTIONS: tuple[Action, ...] = (
 IMAGE_KEYS = (
     ("A", "autoscale once"),
     ("L", "logarithmic or linear"),
-    ("R", "reset view"),
+    ("R or double click", "reset view"),
     ("M", "next colour map"),
     ("arrows", "move the cursor by a pixel"),
 )

@@ -144,6 +144,7 @@ class HeaderBar(QWidget):
             "latency": f"{latency.p99:.0f}" if latency.p99 else UNKNOWN_VALUE,
             "jitter": f"{latency.jitter_p99:.0f}" if latency.p99 else UNKNOWN_VALUE,
         }
+        self.readouts["rate"].set_name("simulated rate" if known and state.simulated else "frame rate")
         for name, text in values.items():
             self.readouts[name].show_value(text if known and has_engine(state) else UNKNOWN_VALUE)
 

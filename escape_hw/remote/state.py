@@ -158,6 +158,7 @@ class LoopState(StateDocument):
     gain: float = 0.0
     leak: float = 0.0
     dropped_modes: int = 0
+    #: Number of controlled modes, without the dropped ones.
     n_modes: int = 0
     residual_nm: float = 0.0
     #: Running Strehl ratio (peak), with a science camera and a model PSF.

@@ -84,6 +84,7 @@ def _reset(stage: Stage) -> None:
 #: Check of the effect of each action. The test of an action without a check fails.
 CHECKS: dict[str, Callable[[Stage], None]] = {
     "open_product": lambda s: s.refused("chosen.fits"),
+    "runs": lambda s: _is(s.window.run_browser.isVisible()),
     "open_run": lambda s: s.refused("saved"),
     "save_png": lambda s: s.saved("png"),
     "save_csv": _saved_csv,

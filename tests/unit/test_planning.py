@@ -64,3 +64,9 @@ def test_the_share_of_clipped_pokes_is_that_of_the_run(limits: tuple[str, ...], 
     assert float(warning.split()[1]) / 100 == pytest.approx(share, abs=0.08)
     assert calibration_document(result)["clipped_pokes"] == result.matrix.metrics["clipped_pokes"]
     assert plan.stroke <= bench.config.devices.dm.limits.max_stroke
+
+
+def test_the_model_psf_takes_the_time_of_the_science_camera(bench: Bench) -> None:
+    plan = ProcedurePlanner(bench).plan("model-psf", {"frames": 20})
+    assert bench.science is not None
+    assert plan.seconds == pytest.approx(20 / bench.science.settings.frame_rate_hz, rel=0.05)
