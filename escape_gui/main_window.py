@@ -22,6 +22,7 @@ from PySide6.QtWidgets import (
     QWidget,
 )
 
+from escape_gui.client.alarms import AlarmMonitor
 from escape_gui.client.availability import tooltip
 from escape_gui.client.session import Session
 from escape_gui.panels import PANELS
@@ -33,10 +34,11 @@ from escape_gui.settings import Settings, save_settings
 from escape_gui.theme import Theme
 from escape_gui.widgets.controls import Level, Overlay, column
 from escape_gui.window.actions import ACTIONS, MENUS, format_shortcuts, help_page, keyboard_table
+from escape_gui.window.alarm_dialog import AlarmDialog
 from escape_gui.window.closing import CloseQuestion, is_busy
 from escape_gui.window.docks import WORKSPACES, Dock, arrange_docks, hide_orphan_tab_bars, workspace
 from escape_gui.window.export import Exporter
-from escape_gui.window.header import ControlBanner, FaultBanner, FrozenBanner, HeaderBar
+from escape_gui.window.header import AlarmBanner, ControlBanner, FaultBanner, FrozenBanner, HeaderBar
 from escape_gui.window.notifications import NotificationBar, StateNotifier
 from escape_gui.window.run_browser import RunBrowser
 from escape_gui.window.update_timer import UpdateTimer
@@ -85,6 +87,9 @@ class MainWindow(QMainWindow):
             self.context, self.actions_by_name["open_loop"], self.actions_by_name["flatten"]
         )
         self.fault_banner = FaultBanner(self.context, self.actions_by_name["clear_fault"])
+        self.alarms = AlarmMonitor(settings.alarms)
+        self.alarm_banner = AlarmBanner(self.context, self.actions_by_name["acknowledge"])
+        self.alarm_dialog = AlarmDialog(self, settings)
         self.frozen_banner = FrozenBanner(self.context, self.actions_by_name["freeze"])
         self.control_banner = ControlBanner(self.context, self.actions_by_name["take_control"])
         self.tabs = self._make_tabs()
@@ -175,6 +180,8 @@ class MainWindow(QMainWindow):
             "give_back": lambda: ask("release control", lambda server: server.release()),
             "record": self.toggle_recording,
             "clear_fault": lambda: ask("clear the fault", lambda server: server.clear_fault()),
+            "alarms": self.alarm_dialog.open_settings,
+            "acknowledge": self.alarms.acknowledge,
             "help_panel": self.show_panel_help,
             "keys": self.toggle_keyboard_table,
         }
@@ -217,15 +224,8 @@ class MainWindow(QMainWindow):
         top = QWidget()
         top.setObjectName("header")
         top.setAttribute(Qt.WidgetAttribute.WA_StyledBackground)
-        column(
-            bar,
-            self.header,
-            self.fault_banner,
-            self.control_banner,
-            self.frozen_banner,
-            parent=top,
-            spacing=0,
-        )
+        banners = (self.fault_banner, self.alarm_banner, self.control_banner, self.frozen_banner)
+        column(bar, self.header, *banners, parent=top, spacing=0)
         self.setMenuWidget(top)
 
     # ------------------------------------------------------------ layout
@@ -299,8 +299,10 @@ class MainWindow(QMainWindow):
         session = self.context.session
         now = session.request_context
         state = now.state
-        if now.live:
+        if now.live and now.connected:
             session.history.update(state)
+            self.alarms.update(state)
+        self.alarm_banner.show_alarms(self.alarms.unacknowledged, muted=self._settings.alarms_muted)
         self.header.show_state(state, connected=now.connected, live=now.live, mine=now.may_write)
         self.fault_banner.show_state(state)
         self.control_banner.show_state(state, offered=now.connected and now.live and not now.may_write)

@@ -93,6 +93,8 @@ ACTIONS: tuple[Action, ...] = (
            ("Ctrl+Shift+L",), reason_no_release),
     Action("record", "&Loop", "&Record telemetry", "Start or stop recording every frame to disk.",
            ("Ctrl+R",), reason_no_change),
+    Action("alarms", "&Loop", "A&larms…", "Set the limits of the alarms, or mute them."),
+    Action("acknowledge", "&Loop", "Ac&knowledge alarms", "Acknowledge all alarms.", ("Ctrl+K",)),
     Action("clear_fault", "&Loop", "&Clear fault", "Clear the latched fault and enable the mirror.",
            (), reason_no_clear_fault),
     Action("help_panel", "&Help", "This &panel", "Help on the panel with the focus.", ("F1",)),

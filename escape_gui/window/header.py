@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 
 from PySide6.QtCore import QSize, Qt
 from PySide6.QtGui import QAction, QResizeEvent
-from PySide6.QtWidgets import QHBoxLayout, QLabel, QPushButton, QSizePolicy, QWidget
+from PySide6.QtWidgets import QApplication, QHBoxLayout, QLabel, QPushButton, QSizePolicy, QWidget
 
 from escape_gui.client.availability import UNKNOWN_VALUE, has_engine, has_frames, is_measured
 from escape_gui.panels.base import Context
@@ -208,6 +209,8 @@ def _follow_action(button: QPushButton, action: QAction) -> None:
     synchronise()
 
 
+#: Interval of the sound of an alarm, seconds.
+_SOUND_PERIOD_S = 2.0
 #: Silence of the client in control from which the window offers to take over; several heartbeats, seconds.
 _SILENCE_S = 3.0
 
@@ -258,6 +261,22 @@ class ControlBanner(Banner):
     def show_state(self, state: State, *, offered: bool) -> None:
         """Show or hide the row; ``offered``: this window can take control and does not have it."""
         self.show_text(control_offer(state) if offered and is_measured(state) else "")
+
+
+class AlarmBanner(Banner):
+    """Shows alarms until they are acknowledged, with a sound every few seconds."""
+
+    def __init__(self, context: Context, acknowledge: QAction) -> None:
+        super().__init__(context, Level.ERROR, "ALARM", _action_button("Acknowledge", acknowledge))
+        self._sounded_s = 0.0
+
+    def show_alarms(self, texts: Sequence[str], *, muted: bool) -> None:
+        """Show the texts of alarms, if there are any."""
+        self.show_text("\n".join(texts))
+        now = time.monotonic()
+        if texts and not muted and now - self._sounded_s > _SOUND_PERIOD_S:
+            self._sounded_s = now
+            QApplication.beep()
 
 
 class FrozenBanner(Banner):

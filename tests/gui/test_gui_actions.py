@@ -109,6 +109,8 @@ CHECKS: dict[str, Callable[[Stage], None]] = {
     "take_control": lambda s: s.asked("acquire", take_over=True),
     "give_back": lambda s: s.asked("release"),
     "record": lambda s: s.asked("record", args=(True,)),
+    "alarms": lambda s: _is(s.window.alarm_dialog.isVisible()),
+    "acknowledge": lambda s: _is(s.window.alarms.unacknowledged == ()),
     "clear_fault": lambda s: s.asked("clear_fault"),
     "help_panel": lambda s: _is(s.window.overlay.isVisible() and "sensor" in s.window.overlay.page),
     "keys": lambda s: _is("Ctrl+Shift+F" in s.window.overlay.page),
