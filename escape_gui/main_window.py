@@ -253,8 +253,9 @@ class MainWindow(QMainWindow):
             arrange_docks(self, docks, self.workspace)
         self.resize(size)
         hide_orphan_tab_bars(self, docks)
-        # The layout of a larger window must not enlarge this one when Qt calculates its least size later.
-        QTimer.singleShot(0, self, lambda: self.resize(self.size().boundedTo(size)))
+        if self.isVisible() and not (self.isMaximized() or self.isFullScreen()):
+            # The layout of a larger window must not enlarge this one when Qt calculates its least size later.
+            QTimer.singleShot(0, self, lambda: self.resize(self.size().boundedTo(size)))
         # Docks that were shown again lie above everything else.
         self.overlay.raise_()
 
