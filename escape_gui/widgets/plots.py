@@ -96,6 +96,8 @@ class StripChart(Plot):
     def __init__(self, theme: Theme, name: str, y: str, span_s: float = 120.0, number: int = 0) -> None:
         super().__init__(theme, name, "time before now [s]", y)
         self._line = self.curve(number, alone=True, connect="finite")
+        # Room for the upper half of the highest tick label.
+        self.getPlotItem().layout.setContentsMargins(1, 8, 1, 1)
         # Hours are more points than pixels.
         self._line.setDownsampling(auto=True, method="peak")
         self.getPlotItem().enableAutoRange(axis="y")
