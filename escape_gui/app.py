@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes.util
 import logging
 import os
 import signal
@@ -28,6 +27,7 @@ from escape_hw.config.loader import load_system
 from escape_hw.errors import ConfigError
 from escape_hw.remote.address import find_server, running_servers
 from escape_hw.remote.state import Phase
+from escape_hw.runtime.host.doctor import missing_qt_libraries
 
 log = logging.getLogger(__name__)
 #: System to serve if none is named and no server runs.
@@ -53,8 +53,8 @@ def require_display() -> None:
         raise ConfigError(
             "no display: log in with 'ssh -X', or set QT_QPA_PLATFORM=offscreen for --screenshot without one"
         )
-    if ctypes.util.find_library("xcb-cursor") is None:
-        raise ConfigError("Qt needs the library libxcb-cursor: install it with 'apt install libxcb-cursor0'")
+    if missing := missing_qt_libraries():
+        raise ConfigError(f"Qt needs libraries for the display: 'apt install {' '.join(missing)}'")
 
 
 def qt_application() -> QApplication:
@@ -78,6 +78,7 @@ class WindowController(QObject):
     ) -> None:
         super().__init__()
         self.window, self.session, self.local_server = window, session, local_server
+        window.started_server = local_server is not None
         self._live: LiveSource | None = None
         self.attachment = ServerAttachment(address)
         self.attachment.attached.connect(self._attached)
@@ -99,8 +100,10 @@ class WindowController(QObject):
             self.window.notifications.show_message(Level.ERROR, "The server did not start", exit_message)
 
     def close(self) -> None:
-        """Disconnect, and stop the local server with a flat mirror. Close the session first."""
-        if self.local_server is not None:
+        """Disconnect, and stop the local server unless it is left running. Close the session first."""
+        if self.local_server is not None and self.window.leave_server:
+            self.local_server.leave()
+        elif self.local_server is not None:
             self.local_server.terminate(None if self._live is None else self._live.connection)
         self.attachment.close()
 
@@ -151,9 +154,11 @@ def run(system: str, address: str, screenshot: Path | None, reset_settings: bool
     else:
         controller = WindowController(window, session, address, local_server)
     window.update_timer.start()
+    if screenshot is None:
+        window.fit_to_screen(window.screen().availableGeometry())
     window.show()
     try:
-        with _close_on_signals(qt_app):
+        with _close_on_signals(window):
             code = qt_app.exec()
         return code if screenshot is None or not isinstance(session.source, EmptySource) else 1
     finally:
@@ -176,14 +181,15 @@ def _find_or_start_server(system: str, address: str) -> tuple[str, LocalServer |
 
 
 @contextmanager
-def _close_on_signals(qt_app: QApplication) -> Iterator[None]:
-    """Close all windows on Ctrl-C, SIGTERM and SIGHUP, because Qt swallows an exception raised in a slot.
+def _close_on_signals(window: MainWindow) -> Iterator[None]:
+    """Close the window on Ctrl-C, SIGTERM and SIGHUP, because Qt swallows an exception raised in a slot.
 
+    Nobody can be asked then: a local server with a run or a closed loop goes on.
     Python runs the handler at the next tick of the window's timer.
     """
 
     def close(*_: object) -> None:
-        QTimer.singleShot(0, qt_app.closeAllWindows)
+        QTimer.singleShot(0, window.close_without_question)
 
     numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
     previous_handlers = {number: signal.signal(number, close) for number in numbers}
@@ -200,7 +206,7 @@ def _take_screenshot(window: MainWindow, session: Session, path: Path) -> None:
 
     def take() -> None:
         save_png(path, window)
-        window.close()
+        window.close_without_question()
 
     def check() -> None:
         source = session.source

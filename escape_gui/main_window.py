@@ -5,10 +5,11 @@ from __future__ import annotations
 import base64
 import logging
 from collections.abc import Callable, Sequence
+from datetime import datetime
 from functools import partial
 from pathlib import Path
 
-from PySide6.QtCore import QByteArray, Qt
+from PySide6.QtCore import QByteArray, QPoint, QRect, QSize, Qt, QTimer
 from PySide6.QtGui import QAction, QCloseEvent, QKeySequence
 from PySide6.QtWidgets import (
     QApplication,
@@ -21,26 +22,36 @@ from PySide6.QtWidgets import (
     QWidget,
 )
 
+from escape_gui.client.alarms import AlarmMonitor
 from escape_gui.client.availability import tooltip
 from escape_gui.client.session import Session
 from escape_gui.panels import PANELS
 from escape_gui.panels.base import Context, Panel
+from escape_gui.panels.loop import LoopPanel
 from escape_gui.replay.playback import PlaybackBar, RecordingOpener
 from escape_gui.replay.source import ReplaySource
 from escape_gui.settings import Settings, save_settings
 from escape_gui.theme import Theme
 from escape_gui.widgets.controls import Level, Overlay, column
 from escape_gui.window.actions import ACTIONS, MENUS, format_shortcuts, help_page, keyboard_table
+from escape_gui.window.alarm_dialog import AlarmDialog
+from escape_gui.window.closing import CloseQuestion, is_busy
 from escape_gui.window.docks import WORKSPACES, Dock, arrange_docks, hide_orphan_tab_bars, workspace
 from escape_gui.window.export import Exporter
-from escape_gui.window.header import FaultBanner, HeaderBar
+from escape_gui.window.header import AlarmBanner, ControlBanner, FaultBanner, FrozenBanner, HeaderBar
 from escape_gui.window.notifications import NotificationBar, StateNotifier
+from escape_gui.window.run_browser import RunBrowser
 from escape_gui.window.update_timer import UpdateTimer
 from escape_hw.errors import StorageError
+from escape_hw.remote.state import State
 
 log = logging.getLogger(__name__)
 #: Version of the dock arrangement that Qt stores; layouts of other versions are discarded.
 LAYOUT_VERSION = 3
+#: Room that is left for the frame of the window manager.
+_FRAME = QSize(8, 32)
+#: Width of the coloured frame of a recorded run, and offset of its window, pixels.
+_REPLAY_FRAME_PX, _REPLAY_OFFSET_PX = 5, 64
 #: Workspace in which recorded runs are opened.
 REPLAY_WORKSPACE = "calibrate"
 
@@ -76,11 +87,16 @@ class MainWindow(QMainWindow):
             self.context, self.actions_by_name["open_loop"], self.actions_by_name["flatten"]
         )
         self.fault_banner = FaultBanner(self.context, self.actions_by_name["clear_fault"])
+        self.alarms = AlarmMonitor(settings.alarms)
+        self.alarm_banner = AlarmBanner(self.context, self.actions_by_name["acknowledge"])
+        self.alarm_dialog = AlarmDialog(self, settings)
+        self.frozen_banner = FrozenBanner(self.context, self.actions_by_name["freeze"])
+        self.control_banner = ControlBanner(self.context, self.actions_by_name["take_control"])
         self.tabs = self._make_tabs()
         self.panels = {kind.name: kind(self.context) for kind in panels}
         self.docks = {name: self._make_dock(panel) for name, panel in self.panels.items()}
         self._make_header()
-        self._status_labels = {name: QLabel() for name in ("frozen", "busy", "saved", "recording", "disk")}
+        self._status_labels = {name: QLabel() for name in ("busy", "saved", "recording", "disk")}
         self.notifications = NotificationBar(theme)
         self.statusBar().addWidget(self.notifications, 1)
         for label in self._status_labels.values():
@@ -93,13 +109,24 @@ class MainWindow(QMainWindow):
         self.update_timer = UpdateTimer(session, self.panels.values(), self.refresh)
         self.playback_bar = PlaybackBar(session)
         self.addToolBar(Qt.ToolBarArea.BottomToolBarArea, self.playback_bar)
-        self.replay = RecordingOpener(self)
+        self.replay = RecordingOpener(self, session)
         self.replay.opened.connect(self.show_recording)
         self.replay.failed.connect(
             lambda why: self.notifications.show_message(Level.ERROR, "Cannot be opened", why)
         )
+        self.run_browser = RunBrowser(self, session)
+        self.run_browser.replay_requested.connect(self.replay.open)
+        loop = self.panels.get(LoopPanel.name)
+        if isinstance(loop, LoopPanel):
+            loop.load_button.clicked.connect(self.run_browser.open_list)
+            self.run_browser.matrix_loaded.connect(lambda product: loop.choose_matrix(product.name))
         #: Windows in which recorded runs were opened from this one.
         self.replay_windows: list[MainWindow] = []
+        #: Whether this window started the server, and whether that server goes on without the window.
+        self.started_server = self.leave_server = False
+        #: Open question before closing.
+        self.close_question: CloseQuestion | None = None
+        self._may_close = False
         session.failed.connect(
             lambda what, why: self.notifications.show_message(Level.ERROR, f"Could not {what}", why)
         )
@@ -129,6 +156,7 @@ class MainWindow(QMainWindow):
         ask = session.ask
         return {
             "open_product": self.replay.ask_product,
+            "runs": self.run_browser.open_list,
             "open_run": self.replay.ask_run,
             "save_png": lambda: self.exporter.panel("png", self.focused_panel()),
             "save_csv": lambda: self.exporter.panel("csv", self.focused_panel()),
@@ -152,6 +180,8 @@ class MainWindow(QMainWindow):
             "give_back": lambda: ask("release control", lambda server: server.release()),
             "record": self.toggle_recording,
             "clear_fault": lambda: ask("clear the fault", lambda server: server.clear_fault()),
+            "alarms": self.alarm_dialog.open_settings,
+            "acknowledge": self.alarms.acknowledge,
             "help_panel": self.show_panel_help,
             "keys": self.toggle_keyboard_table,
         }
@@ -192,7 +222,10 @@ class MainWindow(QMainWindow):
                     submenu.addAction(dock.toggleViewAction())
         bar.setCornerWidget(self.tabs, Qt.Corner.TopRightCorner)
         top = QWidget()
-        column(bar, self.header, self.fault_banner, parent=top, spacing=0)
+        top.setObjectName("header")
+        top.setAttribute(Qt.WidgetAttribute.WA_StyledBackground)
+        banners = (self.fault_banner, self.alarm_banner, self.control_banner, self.frozen_banner)
+        column(bar, self.header, *banners, parent=top, spacing=0)
         self.setMenuWidget(top)
 
     # ------------------------------------------------------------ layout
@@ -204,15 +237,25 @@ class MainWindow(QMainWindow):
         self.tabs.setCurrentIndex(WORKSPACES.index(self.workspace))
         self.setFocus()
 
+    def fit_to_screen(self, available: QRect) -> None:
+        """Make the window fit the available part of a screen, with its frame and its last line."""
+        self.resize(self.size().boundedTo(available.size() - _FRAME))
+        last = available.bottomRight() - QPoint(self.width(), self.height())
+        self.move(
+            max(available.left(), min(self.x(), last.x())), max(available.top(), min(self.y(), last.y()))
+        )
+
     def _apply_layout(self) -> None:
         stored = self._settings.layouts.get(self.workspace.name)
         docks: dict[str, QDockWidget] = dict(self.docks)
         size = self.size()
         if stored is None or not self.restoreState(_bytes(stored), LAYOUT_VERSION):
             arrange_docks(self, docks, self.workspace)
-        # The layout of a larger window must not enlarge this one.
         self.resize(size)
         hide_orphan_tab_bars(self, docks)
+        if self.isVisible() and not (self.isMaximized() or self.isFullScreen()):
+            # The layout of a larger window must not enlarge this one when Qt calculates its least size later.
+            QTimer.singleShot(0, self, lambda: self.resize(self.size().boundedTo(size)))
         # Docks that were shown again lie above everything else.
         self.overlay.raise_()
 
@@ -257,8 +300,13 @@ class MainWindow(QMainWindow):
         session = self.context.session
         now = session.request_context
         state = now.state
+        if now.live and now.connected:
+            session.history.update(state)
+            self.alarms.update(state)
+        self.alarm_banner.show_alarms(self.alarms.unacknowledged, muted=self._settings.alarms_muted)
         self.header.show_state(state, connected=now.connected, live=now.live, mine=now.may_write)
         self.fault_banner.show_state(state)
+        self.control_banner.show_state(state, offered=now.connected and now.live and not now.may_write)
         for one in ACTIONS:
             reason = one.unavailable(now)
             action = self.actions_by_name[one.name]
@@ -276,7 +324,20 @@ class MainWindow(QMainWindow):
             else "",
         )
         self._set_status("disk", f"{state.disk.free_gb:.1f} GB free" if state.disk.folder else "")
-        self.setWindowTitle(f"ESCAPE · {state.system}" if state.system else "ESCAPE")
+        self._show_source(state)
+
+    def _show_source(self, state: State) -> None:
+        """Title, and for a recorded run a frame in the colour of the banner."""
+        source = self.context.session.source
+        if replay := isinstance(source, ReplaySource):
+            title = f"REPLAY · {source.path.name} · ESCAPE"
+        else:
+            title = f"ESCAPE · {state.system}" if state.system else "ESCAPE"
+        self.setWindowTitle(title)
+        frame = f"MainWindow {{ background: {self.context.theme.colours.replay}; }}" if replay else ""
+        if frame != self.styleSheet():
+            self.setStyleSheet(frame)
+            self.setContentsMargins(*(4 * [_REPLAY_FRAME_PX if replay else 0]))
 
     def _set_status(self, name: str, text: str) -> None:
         self._status_labels[name].setText(text)
@@ -299,7 +360,7 @@ class MainWindow(QMainWindow):
     def toggle_freeze(self) -> None:
         """Freeze the panels or resume them; header and safety buttons never freeze."""
         self.update_timer.frozen = not self.update_timer.frozen
-        self._set_status("frozen", "Panels frozen (X to resume)" if self.update_timer.frozen else "")
+        self.frozen_banner.show_frozen(f"{datetime.now():%H:%M:%S}" if self.update_timer.frozen else "")
 
     def toggle_keyboard_table(self) -> None:
         if self.overlay.isVisible():
@@ -329,14 +390,51 @@ class MainWindow(QMainWindow):
         other = MainWindow(Session(), self._settings.model_copy(deep=True), None, kinds)
         self.replay_windows.append(other)
         other.show_recording(source)
-        other.setWindowTitle(f"ESCAPE · {source.path.name}")
         other.update_timer.start()
+        # The bench stays visible beside the recorded run.
+        other.resize(round(0.85 * self.width()), round(0.85 * self.height()))
+        other.move(self.pos() + QPoint(_REPLAY_OFFSET_PX, _REPLAY_OFFSET_PX))
         other.show()
 
+    def close_without_question(self) -> None:
+        """Close; a server that this window started goes on if something runs there."""
+        self.leave_server = is_busy(self.context.session.source.state)
+        self._may_close = True
+        self.close()
+
+    def _answer_close_question(self, leave_server: bool) -> None:
+        self.leave_server, self._may_close = leave_server, True
+        self.close()
+
+    def _may_close_now(self) -> bool:
+        """Whether nothing has to be asked before closing; otherwise ask."""
+        session = self.context.session
+        state = session.source.state
+        if self._may_close or session.control is None or not session.source.connected:
+            return True
+        if not (self.started_server or is_busy(state)):
+            return True
+        if self.close_question is None:
+            question = CloseQuestion(self, state, mine=session.may_write, started_server=self.started_server)
+            question.answered.connect(self._answer_close_question)
+            question.finished.connect(self._forget_close_question)
+            self.close_question = question
+            question.open()
+        return False
+
+    def _forget_close_question(self) -> None:
+        if self.close_question is not None:
+            self.close_question.deleteLater()
+            self.close_question = None
+
     def closeEvent(self, event: QCloseEvent) -> None:
-        """Save settings and layout; a connected server keeps running."""
+        """Save settings and layout; ask first while something runs, or if this window started the server."""
+        if not self._may_close_now():
+            event.ignore()
+            return
         self.update_timer.stop()
         self.replay.close()
+        self.run_browser.shut_down()
         for other in self.replay_windows:
             other.close()
             other.context.session.close()

@@ -23,6 +23,9 @@ class Settings(BaseModel):
     workspace: str = "operate"
     #: Arrangement of the docks by workspace: Qt's format, base64.
     layouts: dict[str, str] = Field(default_factory=dict)
+    #: Limits of the alarms by name; alarms without a limit are off.
+    alarms: dict[str, float] = Field(default_factory=dict)
+    alarms_muted: bool = False
     #: Size and position of the window: Qt's format, base64.
     geometry: str = ""
 

@@ -42,6 +42,8 @@ class Palette:
     on_simulated: str
     hardware: str
     on_hardware: str
+    replay: str
+    on_replay: str
     #: Safety buttons.
     stop: str
     on_stop: str
@@ -55,6 +57,7 @@ DARK = Palette(
     line="#353b41", text="#e4e7ea", muted="#9aa4ad", accent="#56b4e9", on_accent="#06141d",
     good="#3fc79a", warn="#f0b429", bad="#ff7a6b",
     simulated="#1f3d52", on_simulated="#d6edfb", hardware="#e69f00", on_hardware="#171000",
+    replay="#6d3fa0", on_replay="#ffffff",
     stop="#b3261e", on_stop="#ffffff",
     series=("#56b4e9", "#e69f00", "#2bbf94", "#e08fbb", "#f0e442", "#ff8f4d"),
 )
@@ -63,6 +66,7 @@ LIGHT = Palette(
     line="#b9c0c7", text="#15191d", muted="#4d5760", accent="#005f9e", on_accent="#ffffff",
     good="#00634a", warn="#7d4e00", bad="#b3261e",
     simulated="#cfe5f4", on_simulated="#0b3550", hardware="#ffc04d", on_hardware="#241800",
+    replay="#6d3fa0", on_replay="#ffffff",
     stop="#b3261e", on_stop="#ffffff",
     series=("#0072b2", "#b85c00", "#00795a", "#a84a82", "#7a6f00", "#444c54"),
 )
@@ -167,11 +171,11 @@ def style_sheet(theme: Theme) -> str:
         sheet = sheet.replace(f"@{name};", f"{names[name]};").replace(f"@{name} ", f"{names[name]} ")
     for unit in (2, 4, 6, 8, 12, 16, 24):
         sheet = sheet.replace(f"@{unit}px", f"{theme.pixels(unit)}px")
-    return sheet.replace("@arrow", _ARROW.as_posix())
+    return sheet.replace("@arrow", _ARROW.as_posix()).replace("@up", _UP_ARROW.as_posix())
 
 
-#: Arrow of combo boxes; Qt's has a frame in a colour outside the palettes.
-_ARROW = Path(__file__).with_name("down.png")
+#: Arrows of combo boxes and numbers; Qt's have a frame in a colour outside the palettes.
+_ARROW, _UP_ARROW = (Path(__file__).with_name(f"{name}.png") for name in ("down", "up"))
 _SHEET = """
 QMainWindow, QDialog { background: @window; }
 QMainWindow::separator { background: @window; width: 6px; height: 6px; }
@@ -193,7 +197,7 @@ QPushButton:hover, QToolButton:hover { border: 1px solid @accent; }
 QPushButton:pressed, QToolButton:pressed, QToolButton:checked, QPushButton:checked
     { background: @accent; color: @on_accent; border: 1px solid @accent; }
 QPushButton:disabled, QToolButton:disabled { background: @panel; color: @muted; border: 1px solid @line; }
-QPushButton:focus, QToolButton:focus, QLineEdit:focus, QSpinBox:focus, QDoubleSpinBox:focus, QComboBox:focus,
+QPushButton:focus, QToolButton:focus, QLineEdit:focus, QDoubleSpinBox:focus, QComboBox:focus,
 QTableView:focus, QPlainTextEdit:focus { border: 1px solid @accent; }
 QPushButton#stop { background: @stop; color: @on_stop; border: 1px solid @stop; font-weight: bold; }
 QPushButton#stop:disabled { background: @panel; color: @muted; border: 1px solid @line; }
@@ -201,12 +205,18 @@ QPushButton#stop:focus, QPushButton#stop:hover { border: 1px solid @on_stop; }
 QToolButton#quiet { background: transparent; border: 1px solid transparent; padding: 0 @4px; color: @muted; }
 QToolButton#quiet:hover, QToolButton#quiet:focus { border: 1px solid @accent; color: @text; }
 QToolButton#quiet:checked { background: @button; color: @text; border: 1px solid @accent; }
-QLineEdit, QSpinBox, QDoubleSpinBox, QComboBox { background: @field; color: @text; border: 1px solid @line;
+QLineEdit, QDoubleSpinBox, QComboBox { background: @field; color: @text; border: 1px solid @line;
     border-radius: 4px; padding: @2px @6px; selection-background-color: @accent;
     selection-color: @on_accent; }
-QSpinBox::up-button, QSpinBox::down-button, QDoubleSpinBox::up-button, QDoubleSpinBox::down-button
-    { width: 0; border: none; }
-QLineEdit:disabled, QSpinBox:disabled, QDoubleSpinBox:disabled, QComboBox:disabled { color: @muted; }
+QDoubleSpinBox::up-button, QDoubleSpinBox::down-button { subcontrol-origin: border; width: @16px;
+    border-left: 1px solid @line; }
+QDoubleSpinBox::up-button { subcontrol-position: top right; }
+QDoubleSpinBox::down-button { subcontrol-position: bottom right; }
+QDoubleSpinBox::up-button:hover, QDoubleSpinBox::down-button:hover { background: @button; }
+QDoubleSpinBox::up-arrow { image: url(@up); width: @12px; height: @12px; }
+QDoubleSpinBox::down-arrow { image: url(@arrow); width: @12px; height: @12px; }
+QDoubleSpinBox::up-arrow:off, QDoubleSpinBox::down-arrow:off { image: none; }
+QLineEdit:disabled, QDoubleSpinBox:disabled, QComboBox:disabled { color: @muted; }
 QComboBox::drop-down { border: none; width: @16px; padding-right: @2px; }
 QComboBox::down-arrow { image: url(@arrow); width: @12px; height: @12px; }
 QComboBox QAbstractItemView { background: @field; color: @text; border: 1px solid @line; }
@@ -229,6 +239,7 @@ QScrollBar::handle { background: @line; border-radius: 4px; min-height: 24px; mi
 QScrollBar::add-line, QScrollBar::sub-line { width: 0; height: 0; }
 QScrollBar::add-page, QScrollBar::sub-page { background: transparent; }
 #panel { background: @panel; }
+#header { background: @window; }
 #title { background: @panel; border-bottom: 1px solid @line; }
 #caption { color: @muted; }
 #empty { color: @muted; }

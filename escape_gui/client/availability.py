@@ -38,9 +38,14 @@ def is_measured(state: State) -> bool:
     return state.server_pid != 0
 
 
+def has_engine(state: State) -> bool:
+    """Whether an engine runs; without one, rates, illumination and latency are not measured."""
+    return is_measured(state) and state.engine_pid != 0
+
+
 def has_frames(state: State) -> bool:
     """Whether frames have arrived, so that the illumination is known."""
-    return is_measured(state) and state.rates.frames > 0
+    return has_engine(state) and state.rates.frames > 0
 
 
 def always_available(_: RequestContext) -> str:
@@ -65,6 +70,26 @@ def reason_no_write(now: RequestContext) -> str:
         return ""
     holder = now.state.lease
     return f"{holder.name} on {holder.host} has control" if holder else "take control first (Ctrl+L)"
+
+
+def reason_no_engine(now: RequestContext) -> str:
+    """Why the engine cannot answer."""
+    if reason := reason_no_request(now):
+        return reason
+    if now.state.engine_pid:
+        return ""
+    fault = now.state.fault is not None
+    return "the engine has ended; clear the fault to start it again" if fault else "the engine is starting"
+
+
+def reason_no_change(now: RequestContext) -> str:
+    """Why nothing can be changed in the engine."""
+    return reason_no_write(now) or reason_no_engine(now)
+
+
+def reason_no_start(now: RequestContext) -> str:
+    """Why neither a procedure nor the loop can be started."""
+    return reason_no_change(now) or ("clear the fault first" if now.state.fault is not None else "")
 
 
 def reason_no_abort(now: RequestContext) -> str:

@@ -214,6 +214,11 @@ class LocalServer:
         lines = self._stderr.read().strip().splitlines()[-_MAX_ERROR_LINES:]
         return "\n".join(lines) or f"server exited with code {code}"
 
+    def leave(self) -> None:
+        """Let the server go on; the next window attaches to it."""
+        log.warning("the server (process %d) keeps running", self.process.pid)
+        self._stderr.close()
+
     def terminate(self, connection: Connection | None) -> None:
         """Shut the server down, by a signal (SIGINT) if there is no connection, and wait for it."""
         if self.process.running:

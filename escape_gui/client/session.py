@@ -6,13 +6,16 @@ import logging
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
+from pathlib import Path
 from typing import TypeVar
 
 from PySide6.QtCore import QObject, Qt, Signal
 
 from escape_gui.client.availability import RequestContext
+from escape_gui.client.history import LoopHistory
 from escape_gui.client.product_library import ProductLibrary
 from escape_hw.errors import EscapeError
+from escape_hw.io.run_folder import default_runs_folder
 from escape_hw.remote.client import Connection
 from escape_hw.remote.source import DataSource, Sample
 from escape_hw.remote.state import Geometry, LogLine, ProcedureEntry, State
@@ -61,6 +64,8 @@ class Session(QObject):
         self.source: DataSource = EmptySource()
         #: Receives the requests; ``None`` in replay and before a connection.
         self.control: Connection | None = None
+        #: Strehl ratio and residual over hours.
+        self.history = LoopHistory()
         #: Products listed by the source, loaded for the panels.
         self.library = ProductLibrary()
         self._executors: dict[bool, ThreadPoolExecutor] = {}
@@ -170,3 +175,9 @@ class Session(QObject):
         self._executors.clear()
         if self._pending:
             self._set_pending(0)
+
+
+def runs_folder(session: Session) -> Path:
+    """Folder of the server's runs if it is on this computer, else the user's."""
+    folder = Path(session.source.state.disk.folder or default_runs_folder())
+    return folder if folder.is_dir() else default_runs_folder()

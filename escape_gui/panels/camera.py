@@ -78,9 +78,11 @@ class CameraPanel(Panel):
         self.histogram = Plot(theme, "Histogram of the frame", "counts", "pixels")
         self.histogram.setLogMode(x=False, y=True)
         self._curve = self.histogram.curve(0, alone=True, stepMode="center")
-        self.body.addLayout(row(self.choice, self.set_reference_button, None))
-        for widget in (self.saturation, self.image_view, self.signed, *self.bars, self.histogram):
+        self.body.addLayout(row(self.choice, None))
+        for widget in (self.saturation, self.image_view, self.signed):
             self.body.addWidget(widget)
+        self.body.addLayout(row(self.set_reference_button, *((bar, 1) for bar in self.bars)))
+        self.body.addWidget(self.histogram)
         self.body.setStretchFactor(self.image_view, 1)
         self.body.setStretchFactor(self.signed, 1)
         self._frame: NDArray[Any] | None = None

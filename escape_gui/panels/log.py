@@ -6,7 +6,7 @@ from collections import deque
 from html import escape
 from typing import ClassVar
 
-from PySide6.QtGui import QGuiApplication
+from PySide6.QtGui import QGuiApplication, QTextCursor
 from PySide6.QtWidgets import QComboBox, QLineEdit, QPlainTextEdit, QPushButton
 
 from escape_gui.panels.base import Context, Panel
@@ -55,6 +55,7 @@ class LogPanel(Panel):
         self.body.addWidget(self.text, 1)
         self._lines: deque[LogLine] = deque(maxlen=MAX_LINES)
         self._number = -1
+        self._last_shown, self._repeats = ("", ""), 0
         self._follow_newest = True
         self.text.verticalScrollBar().actionTriggered.connect(self._on_scroll)
         self.apply_theme()
@@ -80,27 +81,37 @@ class LogPanel(Panel):
         return all(word in text for word in self.search.text().lower().split())
 
     def _append(self, lines: list[LogLine]) -> None:
-        if lines:
-            self.text.appendHtml("<br>".join(self._html(line) for line in lines))
+        """Append lines; equal lines in a row are one line with their number and the newest time."""
+        for line in lines:
+            same = (line.level, line.text) == self._last_shown
+            self._last_shown, self._repeats = (line.level, line.text), self._repeats + 1 if same else 1
+            if same:
+                cursor = self.text.textCursor()
+                cursor.movePosition(QTextCursor.MoveOperation.End)
+                cursor.select(QTextCursor.SelectionType.BlockUnderCursor)
+                cursor.removeSelectedText()
+            self.text.appendHtml(self._html(line, self._repeats))
 
-    def _html(self, line: LogLine) -> str:
+    def _html(self, line: LogLine, repeats: int) -> str:
         colours = self.context.theme.colours
         colour = getattr(colours, _COLOURS.get(line.level, "text"))
+        times = f" (× {repeats})" if repeats > 1 else ""
         moment = escape(line.at_utc.partition("T")[2][:8] or line.at_utc)
         level = escape(f"{line.level:<8}").replace(" ", "&nbsp;")
         return (
             f'<span style="color:{colours.muted}">{moment}</span> '
-            f'<span style="color:{colour}">{level} {escape(line.text)}</span>'
+            f'<span style="color:{colour}">{level} {escape(line.text)}{times}</span>'
         )
 
     def _refilter(self) -> None:
         self.text.clear()
+        self._last_shown, self._repeats = ("", ""), 0
         self._append([line for line in self._lines if self._matches(line)])
 
     def clear(self) -> None:
         self._lines.clear()
         self._number = -1
-        self.text.clear()
+        self._refilter()
 
     def apply_theme(self) -> None:
         self.text.setFont(self.context.theme.font(0.9, mono=True))

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import ClassVar
 
 from PySide6.QtCore import Qt
-from PySide6.QtWidgets import QComboBox, QDoubleSpinBox, QGridLayout, QLabel, QPushButton, QSpinBox
+from PySide6.QtWidgets import QComboBox, QGridLayout, QLabel, QPushButton, QWidget
 
-from escape_gui.client.availability import is_measured, reason_no_write
+from escape_gui.client.availability import is_measured, reason_no_change, reason_no_start
 from escape_gui.panels.base import Context, Panel
-from escape_gui.views.loop_form import FIELDS, LoopSettingsEdit
+from escape_gui.views.loop_form import FIELDS, LIMITS, LoopSettingsEdit
 from escape_gui.widgets.controls import (
     HoldButton,
     Level,
@@ -20,7 +21,7 @@ from escape_gui.widgets.controls import (
     set_available,
     text_label,
 )
-from escape_hw.config.system import MAX_GAIN
+from escape_gui.widgets.inputs import NumberBox, ignore_wheel_without_focus
 from escape_hw.remote.client import Connection
 from escape_hw.remote.source import DataSource
 from escape_hw.remote.state import LoopState, Phase, State
@@ -55,24 +56,29 @@ class LoopPanel(Panel):
         self.loop_indicator = StatusIndicator(theme, "closed")
         self.modes = caption()
         self.matrix = QComboBox()
-        self.gain = _spin_box(0.0, MAX_GAIN, 0.05, 4)
-        self.leak = _spin_box(0.0, 1.0, 0.005, 4)
-        self.dropped_modes = QSpinBox()
-        self.dropped_modes.setRange(0, 10000)
-        self.editors = {
-            "matrix": self.matrix, "gain": self.gain, "leak": self.leak, "dropped_modes": self.dropped_modes,
-        }  # fmt: skip
+        ignore_wheel_without_focus(self.matrix)
+        self.load_button = QPushButton("Load…")
+        self.load_button.setToolTip("Load the matrix of another run, also of an earlier night, or of a file")
+        self.gain = NumberBox(*LIMITS["gain"], step=0.05, decimals=4)
+        self.leak = NumberBox(*LIMITS["leak"], step=0.005, decimals=4)
+        self.dropped_modes = NumberBox(*LIMITS["dropped_modes"], step=1, decimals=0)
+        self.numbers = {"gain": self.gain, "leak": self.leak, "dropped_modes": self.dropped_modes}
+        self.editors: dict[str, QWidget] = {"matrix": self.matrix, **self.numbers}
         self.current = {name: QLabel("–") for name in FIELDS}
         self.check_button = QPushButton("Check")
         self.apply_button = QPushButton("Apply")
         self.revert_button = QPushButton("Revert")
         self.revert_button.setToolTip("Revert the form to the current values")
         self.message = text_label()
+        #: Values with which the button closes the loop.
+        self.closing_values = text_label()
         self.close_button = HoldButton("close the loop", theme)
         self._loop = LoopState()
         self._matrices: list[str] = []
-        self._is_edited = False
+        #: Fields that do not follow the state, since the operator changed them.
+        self._edited: set[str] = set()
         self._checked_edit: LoopSettingsEdit | None = None
+        self._message_colour = "text"
         self._build_layout()
         self._connect_signals()
         self.apply_theme()
@@ -91,8 +97,10 @@ class LoopPanel(Panel):
             wide = name == "matrix"
             form.addWidget(self.current[name], 2 * line, 1, 1, 2 if wide else 1)
             form.addWidget(self.editors[name], 2 * line + wide, 1 if wide else 2, 1, 2 if wide else 1)
-            self.editors[name].setToolTip(_TIPS[name])
+            limits = f", {LIMITS[name][0]:g} to {LIMITS[name][1]:g}" if name in LIMITS else ""
+            self.editors[name].setToolTip(f"{_TIPS[name]}{limits}")
             self.editors[name].setAccessibleName(f"{text} setpoint")
+        form.addWidget(self.load_button, 3, 0, Qt.AlignmentFlag.AlignLeft)
         form.setColumnStretch(2, 1)
         form.setColumnStretch(3, 1)
         self.body.addLayout(row(self.loop_indicator, self.modes, None))
@@ -100,12 +108,14 @@ class LoopPanel(Panel):
         self.body.addLayout(row(self.check_button, self.apply_button, self.revert_button, None))
         self.body.addWidget(self.message)
         self.body.addStretch()
+        self.body.addWidget(self.closing_values)
         self.body.addWidget(self.close_button)
 
     def _connect_signals(self) -> None:
-        self.matrix.activated.connect(self._on_edit)
-        for spin in (self.gain, self.leak, self.dropped_modes):
-            spin.valueChanged.connect(self._on_edit)
+        self.matrix.activated.connect(partial(self._on_edit, "matrix"))
+        for name, field in self.numbers.items():
+            field.edited.connect(partial(self._on_edit, name))
+            field.lineEdit().returnPressed.connect(self.check)
         self.check_button.clicked.connect(self.check)
         self.apply_button.clicked.connect(self.apply)
         self.revert_button.clicked.connect(self._revert)
@@ -113,7 +123,7 @@ class LoopPanel(Panel):
 
     # ------------------------------------------------------------ data
     def on_state(self, state: State) -> None:
-        """Show the current values; the form follows them until it is edited."""
+        """Show the current values; a field of the form follows them until it is edited."""
         self._loop = loop = state.loop
         self.show_placeholder(
             state.phase in (Phase.STARTING, Phase.STOPPED), None if is_measured(state) else NO_SERVER_TEXT
@@ -131,8 +141,7 @@ class LoopPanel(Panel):
         summaries = {product.name: product.summary for product in state.products if product.kind == "matrix"}
         if list(summaries) != self._matrices:
             self._set_matrix_choices(summaries)
-        if not self._is_edited:
-            self._revert()
+        self._follow_state()
 
     def _set_matrix_choices(self, summaries: dict[str, str]) -> None:
         selected = self.matrix.currentText()
@@ -141,16 +150,17 @@ class LoopPanel(Panel):
         for k, (name, summary) in enumerate(summaries.items()):
             self.matrix.addItem(name)
             self.matrix.setItemData(k, summary, Qt.ItemDataRole.ToolTipRole)
-        if self._is_edited and selected in summaries:
+        if "matrix" in self._edited and selected in summaries:
             self.matrix.setCurrentText(selected)
         else:
             self.matrix.setCurrentIndex(len(summaries) - 1)  # the newest
 
     def tick(self, source: DataSource) -> None:
         now = self.context.session.request_context
-        reason = reason_no_write(now)
-        not_checked = "" if self._checked_edit else "press Check first"
-        set_available(self.apply_button, "Change the loop now.", reason or not_checked)
+        reason = reason_no_change(now)
+        edit = self._checked_edit
+        nothing = "press Check first" if edit is None else "" if edit.changed(self._loop) else "no changes"
+        set_available(self.apply_button, "Change the loop now.", reason or nothing)
         if self._loop.closed:
             obstacle = "the loop is closed"
         elif not self._matrices:
@@ -158,72 +168,101 @@ class LoopPanel(Panel):
         elif now.state.active_run is not None:
             obstacle = f"{now.state.active_run.name} is running"
         else:
-            obstacle = ""
-        set_available(self.close_button, "Close the loop with the setpoints.", reason or obstacle)
+            obstacle = "press Check first" if self._edited and self._checked_edit is None else ""
+        obstacle = reason_no_start(now) or obstacle
+        set_available(self.close_button, "Close the loop with the values above.", obstacle)
+        self.closing_values.setText("" if obstacle else f"Closes with {self.edit.describe()}.")
+        self.closing_values.setVisible(not obstacle)
 
     # ------------------------------------------------------------ edit, check, apply
     @property
     def edit(self) -> LoopSettingsEdit:
+        """The values of the form."""
         return LoopSettingsEdit(
             self.matrix.currentText(), round(self.gain.value(), 6), round(self.leak.value(), 6),
-            self.dropped_modes.value(),
+            round(self.dropped_modes.value()),
         )  # fmt: skip
 
-    def _on_edit(self) -> None:
-        self._is_edited, self._checked_edit = True, None
-        self.message.setText("Edited; press Check.")
+    def _on_edit(self, name: str) -> None:
+        self._edited.add(name)
+        self._checked_edit = None
+        errors = self.edit.validation_errors(self._loop)
+        self._show_message("\n".join(errors) or "Edited; press Check.", errors=bool(errors))
+
+    def choose_matrix(self, name: str) -> None:
+        """Choose a matrix that was loaded as the setpoint."""
+        self.on_state(self.context.session.source.state)
+        if name in self._matrices:
+            self.matrix.setCurrentText(name)
+            self._on_edit("matrix")
+
+    def _follow_state(self) -> None:
+        """Set the fields that the operator did not edit to the current values."""
+        loop = self._loop
+        if "matrix" not in self._edited and loop.matrix in self._matrices:
+            self.matrix.setCurrentText(loop.matrix)
+        for name in self.numbers.keys() - self._edited:
+            self.numbers[name].setValue(getattr(loop, name))
 
     def _revert(self) -> None:
-        loop = self._loop
-        for widget in self.editors.values():
-            widget.blockSignals(True)
-        if loop.matrix in self._matrices:
-            self.matrix.setCurrentText(loop.matrix)
-        self.gain.setValue(loop.gain)
-        self.leak.setValue(loop.leak)
-        self.dropped_modes.setValue(loop.dropped_modes)
-        for widget in self.editors.values():
-            widget.blockSignals(False)
         self.clear()
+        self._follow_state()
 
     def check(self) -> None:
         """Show the changes, or what is invalid."""
         edit = self.edit
         errors = edit.validation_errors(self._loop)
-        self._checked_edit = None if errors or not edit.changed(self._loop) else edit
-        self.message.setText("\n".join(errors) or f"Apply: {edit.describe_changes(self._loop)}")
+        changed = edit.changed(self._loop)
+        self._checked_edit = None if errors else edit
+        if not errors and not changed:
+            self._edited.clear()
+        self._show_message(
+            "\n".join(errors) or f"Checked: {edit.describe_changes(self._loop)}", errors=bool(errors)
+        )
 
     def apply(self) -> None:
+        """Send the checked changes."""
         if self._checked_edit is not None:
             changed = self._checked_edit.changed(self._loop)
-            self._ask("change the loop", lambda server: server.set_loop(**changed))
+            done = f"Applied: {self._checked_edit.describe_changes(self._loop)}"
+            self._ask("change the loop", lambda server: server.set_loop(**changed), done)
 
     def close_loop(self) -> None:
+        """Close the loop with the values of the form, all of which are current or checked."""
         edit = self.edit
-        if errors := edit.validation_errors(self._loop):
-            self.message.setText("\n".join(errors))
-            return
         self._ask(
             "close the loop",
             lambda server: server.close_loop(edit.matrix, edit.gain or None, edit.leak, edit.dropped_modes),
+            f"Loop closed with {edit.describe()}",
         )
 
-    def _ask(self, what: str, call: Callable[[Connection], object]) -> None:
+    def _ask(self, what: str, call: Callable[[Connection], object], done: str) -> None:
         if self.context.session.control is not None:
-            self.message.setText("Waiting for the server…")
-            self.context.session.ask(what, call, self._on_done, self._on_refused)
+            self._show_message("Waiting for the server…")
+            self.context.session.ask(what, call, lambda _: self._on_done(done), self._on_refused)
 
-    def _on_done(self, _: object) -> None:
+    def _on_done(self, done: str) -> None:
         self.clear()
-        self.message.setText("Done.")
+        self._show_message(done)
 
     def _on_refused(self, reason: str) -> None:
         self._checked_edit = None
-        self.message.setText(reason)
+        self._show_message(reason, errors=True)
+
+    def _show_message(self, text: str, *, errors: bool = False) -> None:
+        """Show a message until the next edit or request."""
+        self._message_colour = "bad" if errors else "text"
+        self.message.setText(text)
+        self.message.setVisible(bool(text))
+        self._apply_message_colour()
+
+    def _apply_message_colour(self) -> None:
+        self.message.setStyleSheet(f"color: {self.context.theme.colour(self._message_colour).name()};")
 
     def clear(self) -> None:
-        self._is_edited, self._checked_edit = False, None
-        self.message.setText("")
+        self._edited.clear()
+        self._checked_edit = None
+        self._show_message("")
 
     def apply_theme(self) -> None:
         mono = self.context.theme.font(mono=True)
@@ -232,14 +271,7 @@ class LoopPanel(Panel):
         for name, editor in self.editors.items():
             wide = name == "matrix"
             editor.setMaximumWidth(self.context.theme.pixels(360 if wide else 180))
+            editor.setMinimumWidth(self.context.theme.pixels(110))
             if not wide:
                 editor.setFont(mono)
-
-
-def _spin_box(low: float, high: float, step: float, digits: int) -> QDoubleSpinBox:
-    spin = QDoubleSpinBox()
-    spin.setRange(low, high)
-    spin.setSingleStep(step)
-    spin.setDecimals(digits)
-    spin.setKeyboardTracking(False)
-    return spin
+        self._apply_message_colour()

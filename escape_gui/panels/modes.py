@@ -55,6 +55,7 @@ class ModesPanel(Panel):
         self._method = ""
         self._loaded = LoadedProducts()
         self._running = self._user_selected = False
+        self._run_id = -1
         self._make_controls()
         self._make_maps()
 
@@ -113,7 +114,12 @@ class ModesPanel(Panel):
     # ------------------------------------------------------------ data
     def on_state(self, state: State) -> None:
         """Request the products; at the end of a measurement its product replaces the live matrix."""
-        running = state.active_run is not None
+        run = state.active_run if self.context.session.live else None
+        if run is not None and run.id != self._run_id:
+            # The maps of the run before are not what is being measured now.
+            self._run_id = run.id
+            self._live.clear()
+        running = run is not None
         self.dirty |= running != self._running
         self._running = running
         self.context.session.library.request(state.products)

@@ -1,4 +1,4 @@
-"""Strehl ratio and residual over the last minutes."""
+"""Strehl ratio and residual over the last minutes and hours."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ from typing import ClassVar
 
 import numpy as np
 
+from escape_gui.client.availability import UNKNOWN_VALUE
 from escape_gui.panels.base import Context, ExportArray, Panel
 from escape_gui.panels.psf import NO_REFERENCE, NO_REFERENCE_TIP
-from escape_gui.widgets.controls import Readout, caption, row
-from escape_gui.widgets.plots import StripChart, TimeSeriesBuffer
+from escape_gui.widgets.controls import Readout, SegmentedButton, caption, row
+from escape_gui.widgets.plots import StripChart
 from escape_hw.remote.source import DataSource
 from escape_hw.remote.state import State
 
-_BUFFER_SIZE = 4096
-#: Interval between two states from which the curves have a gap, seconds.
-_GAP_S = 2.0
+#: Time spans to choose from, seconds.
+SPANS_S = {"2 min": 120.0, "20 min": 1200.0, "2 h": 7200.0, "12 h": 43200.0}
 
 
 class PerformancePanel(Panel):
@@ -26,8 +26,8 @@ class PerformancePanel(Panel):
     title: ClassVar[str] = "Performance"
     help: ClassVar[str] = (
         "Strehl ratio of the science camera (peak relative to the reference PSF), and residual wavefront of "
-        "the controlled modes, over the last two minutes. Gaps: the panel was hidden, the loop was open, or "
-        "there is no reference PSF."
+        "the controlled modes, over the last 2 minutes to 12 hours. They are recorded while the window is "
+        "open, also while this panel is hidden. Gaps: the loop was open, or there is no reference PSF."
     )
     rate_hz: ClassVar[float] = 10.0
     placeholder: ClassVar[str] = (
@@ -48,48 +48,50 @@ class PerformancePanel(Panel):
         self.reference_missing_label = caption(NO_REFERENCE)
         self.reference_missing_label.setToolTip(NO_REFERENCE_TIP)
         self.reference_missing_label.hide()
-        self.body.addLayout(row(*self.readouts.values(), self.reference_missing_label, None, spacing=24))
+        self.span = SegmentedButton("Time span", tuple(SPANS_S), ["Show the last time span"] * len(SPANS_S))
+        self.span.chosen.connect(self._on_span_chosen)
+        self.body.addLayout(row(*self.readouts.values(), None, spacing=24))
+        self.body.addLayout(row(self.span, self.reference_missing_label, None))
         self.body.addWidget(self.strehl, 1)
         self.body.addWidget(self.residual, 1)
-        self._history = {"strehl": TimeSeriesBuffer(_BUFFER_SIZE), "residual": TimeSeriesBuffer(_BUFFER_SIZE)}
-        self._last_state_s = time.monotonic()
+        self._last_drawn_s = 0.0
+
+    def _on_span_chosen(self, name: str) -> None:
+        for chart in (self.strehl, self.residual):
+            chart.set_span(SPANS_S[name])
+        self._last_drawn_s = 0.0
 
     def on_state(self, state: State) -> None:
-        loop, now = state.loop, time.monotonic()
-        if loop.closed:
-            self.show_placeholder(False)
-        if self.shows_placeholder:
-            return
-        strehl = np.nan if loop.strehl is None or not loop.closed else 100 * loop.strehl
-        # Zero until the first measurement after closing.
-        residual = loop.residual_nm if loop.closed and loop.residual_nm > 0 else np.nan
-        if now - self._last_state_s > _GAP_S:
-            for history in self._history.values():
-                history.add(now, np.nan)
-        self._last_state_s = now
-        self._history["strehl"].add(now, strehl)
-        self._history["residual"].add(now, residual)
+        history, loop = self.context.session.history, state.loop
+        history.update(state)
+        self.show_placeholder(not history.has_data)
+        strehl = loop.strehl if loop.closed else None
         sigma = "" if loop.strehl_sigma is None else f" ± {100 * loop.strehl_sigma:.1f}"
-        self.readouts["strehl"].show_value("–" if np.isnan(strehl) else f"{strehl:.1f}{sigma}")
+        self.readouts["strehl"].show_value(UNKNOWN_VALUE if strehl is None else f"{100 * strehl:.1f}{sigma}")
         has_reference = any(stream.name == "model_psf" for stream in state.streams)
-        self.reference_missing_label.setVisible(loop.closed and bool(np.isnan(strehl)) and not has_reference)
-        self.readouts["residual"].show_value("–" if np.isnan(residual) else f"{residual:.1f}")
+        self.reference_missing_label.setVisible(loop.closed and strehl is None and not has_reference)
+        measured = loop.closed and loop.residual_nm > 0
+        self.readouts["residual"].show_value(f"{loop.residual_nm:.1f}" if measured else UNKNOWN_VALUE)
 
     def tick(self, source: DataSource) -> None:
-        if not self.shows_placeholder:
-            now = time.monotonic()
-            self.strehl.show_history(self._history["strehl"], now)
-            self.residual.show_history(self._history["residual"], now)
+        now, history = time.monotonic(), self.context.session.history
+        # Hours are drawn once a second.
+        if self.shows_placeholder or (self.strehl.span_s > 120 and now - self._last_drawn_s < 1.0):
+            return
+        self._last_drawn_s = now
+        self.strehl.show_history(history.strehl, now)
+        self.residual.show_history(history.residual, now)
 
-    def clear(self) -> None:
-        for history in self._history.values():
-            history.clear()
+    def reset(self) -> None:
+        """The history survives the end of an engine and a reconnection."""
+        super().reset()
+        self.show_placeholder(not self.context.session.history.has_data)
 
     def export_arrays(self) -> tuple[ExportArray, ...]:
         """One table of both curves; times in seconds before now."""
         if self.shows_placeholder:
             return ()
-        times, strehl = self._history["strehl"].arrays
-        _, residual = self._history["residual"].arrays
+        history = self.context.session.history
+        (times, strehl), (_, residual) = history.strehl.arrays, history.residual.arrays
         table = np.stack([times - time.monotonic(), strehl, residual], axis=1)
         return (ExportArray("performance", table, "", ("time [s]", "strehl [%]", "residual [nm rms]")),)

@@ -13,17 +13,27 @@ from PySide6.QtWidgets import QComboBox, QGridLayout, QLabel, QProgressBar, QPus
 
 from escape_gui.client.availability import (
     reason_no_abort,
+    reason_no_engine,
     reason_no_pause,
     reason_no_request,
-    reason_no_write,
+    reason_no_start,
 )
 from escape_gui.panels.base import Context, Panel
 from escape_gui.views import procedure_form as form_text
 from escape_gui.views.mode_maps import ModeStatistics
 from escape_gui.widgets.argument_form import ArgumentForm
-from escape_gui.widgets.controls import row, scroll_area, set_available, text_label
+from escape_gui.widgets.controls import (
+    QUALITY_LEVELS,
+    Level,
+    row,
+    scroll_area,
+    set_available,
+    text_label,
+)
+from escape_gui.widgets.inputs import ignore_wheel_without_focus
 from escape_hw.remote.source import DataSource, Sample
 from escape_hw.remote.state import Arguments, FinishedRun, ProcedureEntry, ProcedurePlan, State
+from escape_hw.report.verdict import assess
 
 #: Delay between the last edit and the request for a plan.
 _PLAN_DELAY_MS = 400
@@ -68,6 +78,7 @@ class ProcedurePanel(Panel):
     def _make_form(self) -> None:
         self.choice = QComboBox()
         self.choice.setAccessibleName("Procedure")
+        ignore_wheel_without_focus(self.choice)
         self.choice.currentIndexChanged.connect(self._on_procedure_selected)
         self._description = text_label()
         self.form = ArgumentForm()
@@ -102,16 +113,18 @@ class ProcedurePanel(Panel):
         result = QWidget()
         grid = QGridLayout(result)
         grid.setContentsMargins(0, 0, 0, 0)
-        self.outcome, self.numbers = text_label(), text_label()
+        self.outcome, self.verdict, self.numbers = text_label(), text_label(), text_label()
+        self._verdict_level = Level.NEUTRAL
         self.report, self.folder = QPushButton("Open report"), QPushButton("Open folder")
         self.report.clicked.connect(lambda: self._open(self._product("report")))
         self.folder.clicked.connect(lambda: self._open(self._ended.folder if self._ended else ""))
         grid.addWidget(self.outcome, 0, 0, 1, 3)
-        grid.addWidget(self.numbers, 1, 0, 1, 3)
-        grid.addWidget(self.report, 2, 0)
-        grid.addWidget(self.folder, 2, 1)
+        grid.addWidget(self.verdict, 1, 0, 1, 3)
+        grid.addWidget(self.numbers, 2, 0, 1, 3)
+        grid.addWidget(self.report, 3, 0)
+        grid.addWidget(self.folder, 3, 1)
         grid.setColumnStretch(2, 1)
-        grid.setRowStretch(3, 1)
+        grid.setRowStretch(4, 1)
         self._result_area = scroll_area(result)
         self.body.addWidget(self._result_area, 100)
         self.body.addStretch(1)
@@ -145,10 +158,10 @@ class ProcedurePanel(Panel):
         _set_text(self.progress, "" if running is None else form_text.progress_line(running))
         _set_text(self._metrics, "" if running is None else self._metrics_text(running.metrics))
         self.pause.setText("Resume" if running is not None and running.paused else "Pause")
-        # Hidden during a run, to leave more room for the form.
-        self._result_area.setVisible(self._ended is not None and running is None)
         if state.last_run is not None and (self._ended is None or state.last_run.id != self._ended.id):
             self._show_ended(state.last_run)
+        # Hidden during a run, to leave more room for the form.
+        self._result_area.setVisible(self._ended is not None and running is None)
 
     def on_sample(self, stream: str, sample: Sample) -> None:
         self._matrix[stream] = sample.data
@@ -165,10 +178,13 @@ class ProcedurePanel(Panel):
         if ended.document:
             self._documents[ended.name] = ended.document
         _set_text(self.outcome, form_text.result_line(ended))
+        verdict = assess(ended.document)
+        self._verdict_level = Level.NEUTRAL if verdict is None else QUALITY_LEVELS[verdict.quality]
+        _set_text(self.verdict, "" if verdict is None else str(verdict))
+        self._apply_verdict_colour()
         _set_text(self.numbers, "\n".join(form_text.comparison_lines(ended.document, before)))
         self.report.setVisible(bool(self._product("report")))
         self.folder.setVisible(bool(ended.folder))
-        self._result_area.show()
 
     def _product(self, name: str) -> str:
         return self._ended.products.get(name, "") if self._ended is not None else ""
@@ -205,6 +221,9 @@ class ProcedurePanel(Panel):
 
     def _apply_plan_colour(self) -> None:
         self.plan.setStyleSheet(f"color: {self.context.theme.colour(self._plan_level).name()};")
+
+    def _apply_verdict_colour(self) -> None:
+        self.verdict.setStyleSheet(f"color: {self.context.theme.colour(self._verdict_level.value).name()};")
 
     # ------------------------------------------------------------ requests
     def ask_plan(self) -> None:
@@ -245,8 +264,8 @@ class ProcedurePanel(Panel):
         busy = "a procedure is running" if now.state.active_run is not None else ""
         not_checked = "" if self._plan is not None else "the arguments are not checked yet"
         for button, tip, reason in (
-            (self.check, "Check the arguments and show the plan; nothing moves.", reason_no_request(now)),
-            (self.start, "Start the procedure.", reason_no_write(now) or busy or not_checked),
+            (self.check, "Check the arguments and show the plan; nothing moves.", reason_no_engine(now)),
+            (self.start, "Start the procedure.", reason_no_start(now) or busy or not_checked),
             (self.pause, "Pause between two steps, or resume.", reason_no_pause(now)),
             (self.abort, "Stop and save the data acquired so far.", reason_no_abort(now)),
         ):
@@ -269,7 +288,9 @@ class ProcedurePanel(Panel):
         for label in (self.progress, self._metrics, self.numbers):
             label.setFont(theme.font(0.95, mono=True))
         self._description.setStyleSheet(f"color: {theme.colour('muted').name()};")
+        self.verdict.setFont(theme.font(bold=True))
         self._apply_plan_colour()
+        self._apply_verdict_colour()
 
 
 def _set_text(label: QLabel, text: str) -> None:

@@ -11,13 +11,14 @@ from PySide6.QtWidgets import QGridLayout, QLabel, QPushButton, QTabWidget, QWid
 
 from escape_gui.panels.base import Context, ExportArray, Panel
 from escape_gui.views.convergence import NAMES, UNITS, ConvergenceHistory, RegistrationDrift, short_unit
-from escape_gui.widgets.controls import Level, StatusIndicator, column, row, text_label
+from escape_gui.widgets.controls import QUALITY_LEVELS, Level, StatusIndicator, column, row, text_label
 from escape_gui.widgets.plots import MARKERS, ConvergencePlot, DriftPlot
 from escape_hw.api.registration import PARAMETERS
 from escape_hw.api.results import Estimate
 from escape_hw.remote.source import Sample
 from escape_hw.remote.state import State
 from escape_hw.report.tables import format_with_error
+from escape_hw.report.verdict import Quality, assess
 
 
 class SprintPanel(Panel):
@@ -84,6 +85,8 @@ class SprintPanel(Panel):
         """Take convergence and warnings from the result of a run that fitted or tracked a registration."""
         self._running = state.active_run is not None
         last = state.last_run
+        if self._running:
+            self._last_result_id = -1
         if last is None or last.id == self._last_result_id or self._running:
             return
         self._last_result_id = last.id
@@ -118,7 +121,8 @@ class SprintPanel(Panel):
             None if converged is None else bool(converged),
         )  # fmt: skip
         self.plot.show_convergence(history)
-        level = {None: Level.ACTIVE, True: Level.GOOD, False: Level.ERROR}[history.converged]
+        verdict = assess(self._document)
+        level = Level.ACTIVE if verdict is None else QUALITY_LEVELS[verdict.quality]
         self._indicator.set_status(level, history.headline())
         for k, label in enumerate(self._values):
             sigma = float(np.nan_to_num(history.sigma[k], posinf=0.0))
@@ -126,7 +130,10 @@ class SprintPanel(Panel):
         self._show_notes()
 
     def _show_notes(self) -> None:
+        verdict = assess(self._document)
         warnings = [f"⚠ {one}" for one in self._document.get("warnings") or ()]
+        if verdict is not None and verdict.quality is not Quality.GOOD:
+            warnings.insert(0, str(verdict))
         notes = list(self._document.get("registration_notes") or ())
         self._notes.setText("\n".join([*warnings, *notes]))
         self._notes.setVisible(bool(warnings or notes))

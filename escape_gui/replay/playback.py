@@ -9,7 +9,7 @@ from PySide6.QtCore import QEvent, QObject, Qt, QTimer, Signal
 from PySide6.QtGui import QDropEvent
 from PySide6.QtWidgets import QFileDialog, QLabel, QSlider, QToolBar, QToolButton, QWidget
 
-from escape_gui.client.session import Session
+from escape_gui.client.session import Session, runs_folder
 from escape_gui.replay.source import ReplaySource
 from escape_hw.errors import EscapeError
 
@@ -23,23 +23,29 @@ class RecordingOpener(QObject):
     failed = Signal(str)
     _read = Signal(object)
 
-    def __init__(self, window: QWidget) -> None:
+    def __init__(self, window: QWidget, session: Session) -> None:
         super().__init__(window)
-        self._window = window
+        self._window, self._session = window, session
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="escape-replay")
         window.setAcceptDrops(True)
         window.installEventFilter(self)
         self._read.connect(self._on_read, Qt.ConnectionType.QueuedConnection)
 
     def ask_product(self) -> None:
-        chosen, _ = QFileDialog.getOpenFileName(self._window, "Open a product", "", "Products (*.fits)")
+        chosen, _ = QFileDialog.getOpenFileName(
+            self._window, "Open a product", self._folder(), "Products (*.fits)"
+        )
         if chosen:
             self.open(Path(chosen))
 
     def ask_run(self) -> None:
-        chosen = QFileDialog.getExistingDirectory(self._window, "Open the folder of a run")
+        chosen = QFileDialog.getExistingDirectory(self._window, "Open the folder of a run", self._folder())
         if chosen:
             self.open(Path(chosen))
+
+    def _folder(self) -> str:
+        """Folder in which the dialogs open."""
+        return str(runs_folder(self._session))
 
     def open(self, path: Path) -> None:
         """Start to read a product or a run folder; returns at once."""
@@ -70,8 +76,8 @@ def is_recording(path: Path) -> bool:
     return path.is_dir() or path.suffix.lower() == ".fits"
 
 
-#: Number of steps of the slider, and duration of each in playback.
-_STEPS, _STEP_MS = 60, 150
+#: Largest number of steps of the slider, and duration of each in playback.
+_MAX_STEPS, _STEP_MS = 600, 150
 
 
 class PlaybackBar(QToolBar):
@@ -84,7 +90,6 @@ class PlaybackBar(QToolBar):
         self._session = session
         self._name_label = QLabel()
         self.slider = QSlider(Qt.Orientation.Horizontal)
-        self.slider.setRange(0, _STEPS)
         self.slider.setAccessibleName("Position in the recorded run")
         self.slider.setToolTip("Position in the run: iterations, rounds, seconds of tracking.")
         self.slider.valueChanged.connect(self._seek)
@@ -93,7 +98,8 @@ class PlaybackBar(QToolBar):
         self.play.setCheckable(True)
         self.play.setToolTip("Play the run step by step.")
         self.play.toggled.connect(self._on_play_toggled)
-        for widget in (self._name_label, self.play, self.slider):
+        self.position_label = QLabel()
+        for widget in (self._name_label, self.play, self.slider, self.position_label):
             self.addWidget(widget)
         self._timer = QTimer(self)
         self._timer.setInterval(_STEP_MS)
@@ -112,20 +118,27 @@ class PlaybackBar(QToolBar):
         self.play.setChecked(False)
         self.setVisible(recording is not None and recording.steps > 1)
         if recording is not None:
-            self._name_label.setText(f"{recording.path.name}  ")
-            self.slider.setValue(_STEPS)
+            self._name_label.setText(f"REPLAY of {recording.path.name}  ")
+            self.slider.setRange(1, min(recording.steps, _MAX_STEPS))
+            self.slider.setValue(self.slider.maximum())
+            self._show_position()
 
     def _seek(self, value: int) -> None:
         if (recording := self.recording) is not None:
-            recording.seek(value / _STEPS)
+            recording.seek(value / self.slider.maximum())
+            self._show_position()
+
+    def _show_position(self) -> None:
+        if (recording := self.recording) is not None:
+            self.position_label.setText(f"  step {recording.step} of {recording.steps}  ")
 
     def _on_play_toggled(self, on: bool) -> None:
         self.play.setText("⏸ Pause" if on else "▶ Play")
-        if on and self.slider.value() == _STEPS:
-            self.slider.setValue(0)
+        if on and self.slider.value() == self.slider.maximum():
+            self.slider.setValue(1)
         (self._timer.start if on else self._timer.stop)()
 
     def _step(self) -> None:
         self.slider.setValue(self.slider.value() + 1)
-        if self.slider.value() == _STEPS:
+        if self.slider.value() == self.slider.maximum():
             self.play.setChecked(False)

@@ -17,6 +17,7 @@ from escape_hw.api.registration import PARAMETERS, TO_STREAM_UNITS
 from escape_hw.api.results import CalibrationResult, LoopResult, RegistrationEstimate
 from escape_hw.remote.source import STREAMS, Sample
 from escape_hw.remote.state import (
+    ActiveRun,
     Finish,
     FinishedRun,
     Geometry,
@@ -180,6 +181,14 @@ class ReplaySource:
         """Number of steps of the longest stream; 1 if none has several."""
         return max((stream.length for stream in self._streams.values()), default=1)
 
+    @property
+    def step(self) -> int:
+        """Present step of the longest stream, 1 to :attr:`steps`."""
+        return self._step_of(self.steps)
+
+    def _step_of(self, length: int) -> int:
+        return max(1, min(length, int(np.ceil(self._position * length - 1e-6))))
+
     def seek(self, position: float) -> None:
         """Show the run as it was at a position from 0 to 1."""
         self._position = min(1.0, max(0.0, position))
@@ -190,8 +199,7 @@ class ReplaySource:
         recorded = self._streams.get(stream)
         if recorded is None or self._serial <= after:
             return None
-        step = max(1, min(recorded.length, int(np.ceil(self._position * recorded.length))))
-        data = np.asarray(recorded.at(step))
+        data = np.asarray(recorded.at(self._step_of(recorded.length)))
         return Sample(self._serial, self._opened_ns, self._opened_ns, data, recorded.meta)
 
     def _make_state(self) -> State:
@@ -207,6 +215,8 @@ class ReplaySource:
             seed=int(document.get("seed") or 0),
             phase=Phase.STOPPED,
             loop=_loop_state(run),
+            # Before the last step, the run has no result yet.
+            active_run=None if self.step == self.steps else self._active_run(name),
             last_run=FinishedRun(
                 id=0,
                 name=name,
@@ -219,6 +229,11 @@ class ReplaySource:
             streams=tuple(
                 StreamEntry(name=name, segment="", unit=STREAMS.get(name, "")) for name in self._streams
             ),
+        )
+
+    def _active_run(self, name: str) -> ActiveRun:
+        return ActiveRun(
+            id=0, name=name, arguments={}, stage="replay", completed=self.step, total=self.steps, unit="step"
         )
 
     def geometry(self) -> Geometry:

@@ -135,7 +135,7 @@ def worst_mode(snr: np.ndarray[Any, np.dtype[np.float64]]) -> str:
 
 def result_line(ended: FinishedRun) -> str:
     """How a procedure ended, in one line."""
-    word = {Finish.DONE: "Done", Finish.ABORTED: "Aborted, acquired data saved", Finish.FAILED: "Failed"}
+    word = {Finish.DONE: "Done", Finish.ABORTED: "Aborted", Finish.FAILED: "Failed"}
     return f"{word[ended.finish]}: {ended.name}" + (f". {ended.message}" if ended.message else "")
 
 
@@ -149,6 +149,9 @@ def comparison_lines(now: Mapping[str, Any], before: Mapping[str, Any] | None) -
     snr, old = now.get("snr") or {}, (before or {}).get("snr") or {}
     if isinstance(snr.get("min"), int | float):
         lines.append(f"SNR of the worst mode: {snr['min']:.3g}{_change(snr['min'], old.get('min'), '')}")
+    clipped, frames = now.get("clipped_pokes"), now.get("frames")
+    if isinstance(clipped, int | float) and frames:
+        lines.append(f"Pokes clipped: {100 * clipped / frames:.2g} % ({clipped:.0f} of {frames})")
     strehl = now.get("strehl")
     if isinstance(strehl, dict) and strehl.get("peak"):
         lines.append(f"Strehl ratio: {100 * strehl['peak']['value']:.1f} %")

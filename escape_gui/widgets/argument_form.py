@@ -17,6 +17,7 @@ from PySide6.QtWidgets import (
 
 from escape_gui.views import procedure_form as form_text
 from escape_gui.widgets.controls import caption, column, row, scroll_area
+from escape_gui.widgets.inputs import ignore_wheel_without_focus
 from escape_hw.remote.state import Arguments, ProcedureParameter
 
 
@@ -93,6 +94,7 @@ class ArgumentForm(QWidget):
             return check
         if one.kind in ("choice", "matrix"):
             box = QComboBox()
+            ignore_wheel_without_focus(box)
             box.addItems(
                 list(one.choices) if one.kind == "choice" else [form_text.NO_CHOICE, *self._matrices]
             )

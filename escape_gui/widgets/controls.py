@@ -28,6 +28,7 @@ from PySide6.QtWidgets import (
 from escape_gui.client.availability import tooltip
 from escape_gui.theme import Theme
 from escape_hw.remote.state import DeviceHealth
+from escape_hw.report.verdict import Quality
 
 #: A widget or layout, one with its stretch factor, or ``None`` for stretchable space.
 Item: TypeAlias = QWidget | QLayout | tuple[QWidget | QLayout, int] | None
@@ -199,13 +200,20 @@ class Readout(QWidget):
         self._theme, self._name, self._unit, self._digits = theme, name, unit, digits
         self._value = QLabel("–")
         self._value.setAlignment(Qt.AlignmentFlag.AlignRight | Qt.AlignmentFlag.AlignVCenter)
-        row(caption(name), self._value, caption(unit), parent=self, spacing=4)
+        self._caption = caption(name)
+        row(self._caption, self._value, caption(unit), parent=self, spacing=4)
         self.setSizePolicy(QSizePolicy.Policy.Maximum, QSizePolicy.Policy.Fixed)
         theme.follow(self._apply_theme)
 
     @property
     def text(self) -> str:
         return self._value.text()
+
+    def set_name(self, name: str) -> None:
+        """Change the caption."""
+        if name != self._name:
+            self._name = name
+            self._caption.setText(name)
 
     def show_value(self, text: str) -> None:
         if text != self._value.text():
@@ -245,6 +253,11 @@ HEALTH_LEVELS: dict[DeviceHealth, Level] = {
     DeviceHealth.FAULT: Level.ERROR,
     DeviceHealth.CLOSED: Level.NEUTRAL,
 }
+
+
+QUALITY_LEVELS: dict[Quality, Level] = {
+    Quality.GOOD: Level.GOOD, Quality.USABLE: Level.WARNING, Quality.NOT_USABLE: Level.ERROR,
+}  # fmt: skip
 
 
 class StatusIndicator(QWidget):

@@ -10,7 +10,7 @@ import numpy as np
 import pyqtgraph as pg
 from numpy.typing import NDArray
 from PySide6.QtCore import QPointF, QRectF, Qt, Signal
-from PySide6.QtGui import QKeyEvent
+from PySide6.QtGui import QKeyEvent, QMouseEvent
 from PySide6.QtWidgets import QLabel, QSizePolicy, QWidget
 
 from escape_gui.theme import Theme
@@ -28,6 +28,14 @@ DECADES = 4.0
 _CURSOR_STEPS = {
     Qt.Key.Key_Left: (-1, 0), Qt.Key.Key_Right: (1, 0), Qt.Key.Key_Up: (0, -1), Qt.Key.Key_Down: (0, 1),
 }  # fmt: skip
+
+
+class _ImageView(pg.GraphicsView):  # type: ignore[misc]
+    double_clicked = Signal()
+
+    def mouseDoubleClickEvent(self, event: QMouseEvent) -> None:
+        event.accept()
+        self.double_clicked.emit()
 
 
 class ImageViewer(QWidget):
@@ -61,7 +69,7 @@ class ImageViewer(QWidget):
         self._levels_due = 0.0
         self._cursor: tuple[int, int] | None = None
         self._map = 0
-        self.view = pg.GraphicsView()
+        self.view = _ImageView()
         self.box = pg.ViewBox(lockAspect=True, invertY=True, enableMenu=False, defaultPadding=0.02)
         self.view.setCentralItem(self.box)
         self.image = pg.ImageItem(axisOrder="row-major")
@@ -81,6 +89,7 @@ class ImageViewer(QWidget):
         self.setMinimumSize(96, 96)
         self.view.scene().sigMouseMoved.connect(self._on_mouse_moved)
         self.view.scene().sigMouseClicked.connect(lambda _: self.setFocus())
+        self.view.double_clicked.connect(self.reset_view)
         theme.follow(self._apply_theme)
         self.image.setColorMap(pg.colormap.get(self._maps[0]))
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from PySide6.QtCore import Qt
 from PySide6.QtGui import QColor
 
+from escape_gui.client.history import TimeSeriesBuffer
 from escape_gui.theme import Theme
 from escape_gui.views.convergence import GROUPS, NAMES, ConvergenceHistory, RegistrationDrift, short_unit
 from escape_gui.views.gain_curves import GainCurve, axis_sides
@@ -89,48 +90,31 @@ class Plot(pg.PlotWidget):  # type: ignore[misc]
             item.setPen(self._pen(number, alone))
 
 
-class TimeSeriesBuffer:
-    """Times and values of the last ``size`` entries."""
-
-    def __init__(self, size: int) -> None:
-        self._times = np.full(2 * size, np.nan)
-        self._values = np.full(2 * size, np.nan)
-        self._size, self._end = size, 0
-
-    def add(self, time: float, value: float) -> None:
-        """Add an entry; times in seconds, increasing."""
-        if self._end == self._times.size:
-            for buffer in (self._times, self._values):
-                buffer[: self._size] = buffer[self._size :]
-            self._end = self._size
-        self._times[self._end], self._values[self._end] = time, value
-        self._end += 1
-
-    def clear(self) -> None:
-        self._end = 0
-
-    @property
-    def arrays(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Times and values ``(n,)``, oldest first; views that the next :meth:`add` may overwrite."""
-        part = slice(max(self._end - self._size, 0), self._end)
-        return self._times[part], self._values[part]
-
-
 class StripChart(Plot):
     """A quantity over the last ``span_s`` seconds."""
 
     def __init__(self, theme: Theme, name: str, y: str, span_s: float = 120.0, number: int = 0) -> None:
         super().__init__(theme, name, "time before now [s]", y)
-        self.span_s = span_s
         self._line = self.curve(number, alone=True, connect="finite")
-        self.setXRange(-span_s, 0, padding=0.0)
+        # Room for the upper half of the highest tick label.
+        self.getPlotItem().layout.setContentsMargins(1, 8, 1, 1)
+        # Hours are more points than pixels.
+        self._line.setDownsampling(auto=True, method="peak")
         self.getPlotItem().enableAutoRange(axis="y")
         self.pin_left_axis()
+        self.set_span(span_s)
+
+    def set_span(self, span_s: float) -> None:
+        """Show the last ``span_s`` seconds, in seconds, minutes or hours."""
+        self.span_s = span_s
+        self._unit_s, unit = (1, "s") if span_s <= 120 else (60, "min") if span_s < 7200 else (3600, "h")
+        self.getPlotItem().setLabel("bottom", f"time before now [{unit}]")
+        self.setXRange(-span_s / self._unit_s, 0, padding=0.0)
 
     def show_history(self, history: TimeSeriesBuffer, now: float) -> None:
         times, values = history.arrays
-        recent = times > now - self.span_s
-        self._line.setData(times[recent] - now, values[recent])
+        first = int(np.searchsorted(times, now - self.span_s))
+        self._line.setData((times[first:] - now) / self._unit_s, values[first:])
 
 
 class PlotGrid(pg.GraphicsLayoutWidget):  # type: ignore[misc]
@@ -390,6 +374,8 @@ class ConvergencePlot(_ParameterGrid):
         self._curves: dict[int, ErrorCurve] = {}
         top = self._add_row(0, "Step norm", "", "")
         top.setLogMode(y=True)
+        # In a low plot the labels between two decades overlap.
+        top.getAxis("left").setStyle(maxTextLevel=0)
         self._norm = ErrorCurve(self._theme, 0)
         self._norm.add_to(top)
         groups = GROUPS if self.physical else (("Normalised", "", tuple(range(len(NAMES)))),)

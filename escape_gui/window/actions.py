@@ -15,12 +15,12 @@ from escape_gui.client.availability import (
     UnavailableReason,
     always_available,
     reason_no_abort,
+    reason_no_change,
     reason_no_clear_fault,
     reason_no_pause,
     reason_no_release,
     reason_no_request,
     reason_no_take_control,
-    reason_no_write,
 )
 from escape_gui.panels.base import Panel
 from escape_gui.window.docks import WORKSPACES
@@ -48,6 +48,8 @@ MENUS = ("&File", "&View", "&Loop", "&Help")
 # fmt: off
 ACTIONS: tuple[Action, ...] = (
     Action("open_product", "&File", "&Open product…", "Show a FITS product in these panels.", ("Ctrl+O",)),
+    Action("runs", "&File", "Runs and &matrices…", "Finished runs: load a matrix into the loop, or replay.",
+           ("Ctrl+M",)),
     Action("open_run", "&File", "Open &run folder…", "Replay a finished run in these panels.",
            ("Ctrl+Alt+O",)),
     Action("save_png", "&File", "Save panel as &image…", "Save the panel with the focus as PNG.",
@@ -58,7 +60,8 @@ ACTIONS: tuple[Action, ...] = (
            ("Ctrl+Shift+S",)),
     Action("save_window", "&File", "Save &window as image…", "Save the whole window as PNG.",
            ("Ctrl+Shift+P",)),
-    Action("quit", "&File", "&Quit", "Close the window; the server keeps running.", ("Ctrl+Q",)),
+    Action("quit", "&File", "&Quit", "Close the window; asks while a procedure runs or the loop is closed.",
+           ("Ctrl+Q",)),
     *(
         Action(f"workspace_{one.name}", "&View", f"&{number} {one.title}", f"{one.purpose}.",
                (f"Ctrl+{number}",))
@@ -89,7 +92,9 @@ ACTIONS: tuple[Action, ...] = (
     Action("give_back", "&Loop", "Re&lease control", "Release control for other clients.",
            ("Ctrl+Shift+L",), reason_no_release),
     Action("record", "&Loop", "&Record telemetry", "Start or stop recording every frame to disk.",
-           ("Ctrl+R",), reason_no_write),
+           ("Ctrl+R",), reason_no_change),
+    Action("alarms", "&View", "A&larms…", "Set the limits of the alarms, or mute them."),
+    Action("acknowledge", "&View", "Ac&knowledge alarms", "Acknowledge all alarms.", ("Ctrl+K",)),
     Action("clear_fault", "&Loop", "&Clear fault", "Clear the latched fault and enable the mirror.",
            (), reason_no_clear_fault),
     Action("help_panel", "&Help", "This &panel", "Help on the panel with the focus.", ("F1",)),
@@ -102,7 +107,7 @@ ACTIONS: tuple[Action, ...] = (
 IMAGE_KEYS = (
     ("A", "autoscale once"),
     ("L", "logarithmic or linear"),
-    ("R", "reset view"),
+    ("R or double click", "reset view"),
     ("M", "next colour map"),
     ("arrows", "move the cursor by a pixel"),
 )

@@ -22,12 +22,13 @@ from escape_gui.theme import Theme
 from escape_gui.widgets.controls import HEALTH_LEVELS, StatusIndicator, flat_button, row
 from escape_hw.remote.state import DeviceHealth
 
-#: Height below which a panel scrolls instead of enlarging the window, pixels.
-MIN_PANEL_HEIGHT_PX = 130
+#: Height and width below which a panel scrolls instead of enlarging the window, pixels. Three columns of
+#: this width fit a window of 1024 pixels.
+MIN_PANEL_HEIGHT_PX, MIN_PANEL_WIDTH_PX = 130, 320
 
 
 class _PanelScrollArea(QScrollArea):
-    """Lets a panel be lower than its minimum height, but not narrower than its minimum width."""
+    """Lets a panel be smaller than its minimum size."""
 
     def __init__(self, panel: Panel) -> None:
         super().__init__()
@@ -35,13 +36,13 @@ class _PanelScrollArea(QScrollArea):
         self.setWidgetResizable(True)
         self.setFrameShape(QFrame.Shape.NoFrame)
         self.setFocusPolicy(Qt.FocusPolicy.NoFocus)
-        self.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
         self.setWidget(panel)
 
     def minimumSizeHint(self) -> QSize:
         least = self._panel.minimumSizeHint()
         bar = self.verticalScrollBar().sizeHint().width() if least.height() > MIN_PANEL_HEIGHT_PX else 0
-        return QSize(least.width() + bar, min(least.height(), MIN_PANEL_HEIGHT_PX))
+        width = min(least.width() + bar, MIN_PANEL_WIDTH_PX)
+        return QSize(width, min(least.height(), MIN_PANEL_HEIGHT_PX))
 
     def sizeHint(self) -> QSize:
         return self._panel.sizeHint()

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from PySide6.QtCore import Qt
-from PySide6.QtGui import QAction
-from PySide6.QtWidgets import QGridLayout, QHBoxLayout, QLabel, QPushButton, QWidget
+import time
+from collections.abc import Sequence
 
-from escape_gui.client.availability import UNKNOWN_VALUE, has_frames, is_measured
+from PySide6.QtCore import QSize, Qt
+from PySide6.QtGui import QAction, QResizeEvent
+from PySide6.QtWidgets import QApplication, QHBoxLayout, QLabel, QPushButton, QSizePolicy, QWidget
+
+from escape_gui.client.availability import UNKNOWN_VALUE, has_engine, has_frames, is_measured
 from escape_gui.panels.base import Context
 from escape_gui.widgets.controls import HoldButton, Level, Readout, StatusIndicator, column, row, text_label
 from escape_hw.remote.state import Phase, State
@@ -40,7 +43,7 @@ class ConnectionBanner(QLabel):
         if not connected and not is_measured(state):
             text, keys = NOT_CONNECTED_TEXT, ("button", "text")
         elif not live:
-            text, keys = f"REPLAY · {state.system}", ("button", "text")
+            text, keys = f"REPLAY OF A RECORDED RUN · {state.system} · NOT THE BENCH", ("replay", "on_replay")
         elif not connected:
             text, keys = "NOT CONNECTED · values below are stale", ("stop", "on_stop")
         elif state.simulated:
@@ -57,6 +60,37 @@ class ConnectionBanner(QLabel):
         back, front = (getattr(colours, name) for name in self._palette_keys)
         self.setFont(self._context.theme.font(bold=True))
         self.setStyleSheet(f"background: {back}; color: {front}; padding: 3px;")
+
+
+class _Conditions(QWidget):
+    """Pairs of widgets above each other; the last pairs are hidden where they have no room.
+
+    The safety buttons beside them stay visible at any width.
+    """
+
+    _SPACING_PX = 24
+
+    def __init__(self, pairs: Sequence[tuple[QWidget, QWidget]]) -> None:
+        super().__init__()
+        self._columns = []
+        for pair in pairs:
+            page = QWidget()
+            right = isinstance(pair[0], Readout)
+            column(*(row(None, one) if right else one for one in pair), parent=page, spacing=0)
+            self._columns.append(page)
+        row(*self._columns, None, parent=self, spacing=self._SPACING_PX)
+        self.setSizePolicy(QSizePolicy.Policy.Ignored, QSizePolicy.Policy.Preferred)
+
+    def minimumSizeHint(self) -> QSize:
+        return QSize(0, super().minimumSizeHint().height())
+
+    def resizeEvent(self, event: QResizeEvent) -> None:
+        super().resizeEvent(event)
+        used = 0
+        for one in self._columns:
+            used += one.sizeHint().width()
+            one.setVisible(used <= self.width())
+            used += self._SPACING_PX
 
 
 class HeaderBar(QWidget):
@@ -83,18 +117,13 @@ class HeaderBar(QWidget):
         column(self.connection_banner, self._row(), parent=self, spacing=0)
 
     def _row(self) -> QHBoxLayout:
-        grid = QGridLayout()
-        grid.setHorizontalSpacing(24)
-        grid.setVerticalSpacing(0)
-        indicators = ((self.phase, self.loop), (self.saturation, self.control))
-        for k, pair in enumerate(indicators):
-            for line, widget in enumerate(pair):
-                grid.addWidget(widget, line, k)
-        pairs = (("rate", "lost"), ("rms", "peak"), ("latency", "jitter"))
-        for k, names in enumerate(pairs, len(indicators)):
-            for line, name in enumerate(names):
-                grid.addWidget(self.readouts[name], line, k, Qt.AlignmentFlag.AlignRight)
-        content = row(grid, None, self.open_button, self.flatten_button)
+        pairs: tuple[tuple[QWidget, QWidget], ...] = (
+            (self.phase, self.loop), (self.saturation, self.control),
+            (self.readouts["rate"], self.readouts["lost"]), (self.readouts["rms"], self.readouts["peak"]),
+            (self.readouts["latency"], self.readouts["jitter"]),
+        )  # fmt: skip
+        self.conditions = _Conditions(pairs)
+        content = row((self.conditions, 1), self.open_button, self.flatten_button)
         content.setContentsMargins(8, 4, 8, 4)
         return content
 
@@ -102,6 +131,8 @@ class HeaderBar(QWidget):
         """Update everything; ``mine``: this client holds the lease."""
         self.connection_banner.show_state(state, connected=connected, live=live)
         known = live and is_measured(state)
+        for button in (self.open_button, self.flatten_button):
+            button.setVisible(live)
         self._show_conditions(state, known=known)
         self._show_control(state, replay=connected and not live, mine=mine)
         latency = state.latency
@@ -114,8 +145,9 @@ class HeaderBar(QWidget):
             "latency": f"{latency.p99:.0f}" if latency.p99 else UNKNOWN_VALUE,
             "jitter": f"{latency.jitter_p99:.0f}" if latency.p99 else UNKNOWN_VALUE,
         }
+        self.readouts["rate"].set_name("simulated rate" if known and state.simulated else "frame rate")
         for name, text in values.items():
-            self.readouts[name].show_value(text if known else UNKNOWN_VALUE)
+            self.readouts[name].show_value(text if known and has_engine(state) else UNKNOWN_VALUE)
 
     def _show_conditions(self, state: State, *, known: bool) -> None:
         if known:
@@ -151,11 +183,17 @@ class HeaderBar(QWidget):
 
 def _safety_button(action: QAction, text: str) -> QPushButton:
     """A button that triggers an action but keeps its own text and is always visible."""
-    button = QPushButton(text)
+    button = _action_button(text, action)
     button.setObjectName("stop")
     button.setAccessibleName(text)
-    button.clicked.connect(action.trigger)
     button.setMinimumHeight(40)
+    return button
+
+
+def _action_button(text: str, action: QAction) -> QPushButton:
+    """A button that triggers an action."""
+    button = QPushButton(text)
+    button.clicked.connect(action.trigger)
     _follow_action(button, action)
     return button
 
@@ -171,25 +209,101 @@ def _follow_action(button: QPushButton, action: QAction) -> None:
     synchronise()
 
 
-class FaultBanner(QWidget):
-    """A row below the header, visible during a fault, with a button for the action that clears it."""
+#: Interval of the sound of an alarm, seconds.
+_SOUND_PERIOD_S = 2.0
+#: Silence of the client in control from which the window offers to take over; several heartbeats, seconds.
+_SILENCE_S = 3.0
 
-    def __init__(self, context: Context, clear: QAction) -> None:
+
+def control_offer(state: State) -> str:
+    """Why control is offered: nobody has it, or its holder is silent; empty if somebody has it."""
+    lease, run = state.lease, state.active_run
+    if lease is not None:
+        if lease.silent_s < _SILENCE_S:
+            return ""
+        return (
+            f"{lease.name} on {lease.host} has not responded for {lease.silent_s:.0f} s and loses control in "
+            f"{lease.expires_in_s:.0f} s"
+        )
+    if run is None:
+        return f"No operator has control{'; the loop stays closed' if state.loop.closed else ''}"
+    text = f"No operator has control; '{run.name}' (run {run.id})"
+    if not state.unattended_limit_s:
+        return f"{text} goes on"
+    return f"{text} is aborted in {max(0.0, state.unattended_limit_s - state.unattended_for_s):.0f} s"
+
+
+class Banner(QWidget):
+    """A row below the header with a word, a text and a button; visible while there is a text."""
+
+    def __init__(self, context: Context, level: Level, word: str, button: QPushButton) -> None:
         super().__init__()
         indicator = StatusIndicator(context.theme)
-        indicator.set_status(Level.ERROR, "FAULT")
-        self._text = text_label()
+        indicator.set_status(level, word)
+        self.text, self.button = text_label(), button
+        row(indicator, (self.text, 1), button, parent=self).setContentsMargins(8, 4, 8, 4)
+        self.hide()
+
+    def show_text(self, text: str) -> None:
+        """Show the row, or hide it if the text is empty."""
+        if text != self.text.text():
+            self.text.setText(text)
+        # After the text was set: the height depends on it.
+        self.setVisible(bool(text))
+
+
+class ControlBanner(Banner):
+    """Offers control with a button while nobody uses it."""
+
+    def __init__(self, context: Context, take_control: QAction) -> None:
+        super().__init__(context, Level.WARNING, "CONTROL", _action_button("Take control", take_control))
+
+    def show_state(self, state: State, *, offered: bool) -> None:
+        """Show or hide the row; ``offered``: this window can take control and does not have it."""
+        self.show_text(control_offer(state) if offered and is_measured(state) else "")
+
+
+class AlarmBanner(Banner):
+    """Shows alarms until they are acknowledged, with a sound every few seconds."""
+
+    def __init__(self, context: Context, acknowledge: QAction) -> None:
+        super().__init__(context, Level.ERROR, "ALARM", _action_button("Acknowledge", acknowledge))
+        self._sounded_s = 0.0
+
+    def show_alarms(self, texts: Sequence[str], *, muted: bool) -> None:
+        """Show the texts of alarms, if there are any."""
+        self.show_text("\n".join(texts))
+        now = time.monotonic()
+        if texts and not muted and now - self._sounded_s > _SOUND_PERIOD_S:
+            self._sounded_s = now
+            QApplication.beep()
+
+
+class FrozenBanner(Banner):
+    """Shows that the panels do not follow the data."""
+
+    def __init__(self, context: Context, freeze: QAction) -> None:
+        super().__init__(context, Level.WARNING, "FROZEN", _action_button("Resume (X)", freeze))
+
+    def show_frozen(self, since: str) -> None:
+        """Show the time since when the panels are frozen; empty: they are not."""
+        self.show_text(f"The panels show the data of {since}. The rows above are live." if since else "")
+
+
+class FaultBanner(Banner):
+    """Shows a fault, with a button for the action that clears it."""
+
+    def __init__(self, context: Context, clear: QAction) -> None:
         button = HoldButton("clear", context.theme)
         button.confirmed.connect(clear.trigger)
         _follow_action(button, clear)
-        row(indicator, (self._text, 1), button, parent=self).setContentsMargins(8, 4, 8, 4)
-        self.hide()
+        super().__init__(context, Level.ERROR, "FAULT", button)
 
     def show_state(self, state: State) -> None:
         """Show the fault, or hide the row if there is none."""
         fault = state.fault
-        if fault is not None:
-            text = f"{fault.reason} · {fault.at_utc}"
-            self._text.setText(f"{text}\n{fault.remedy}" if fault.remedy else text)
-        # After the text was set: the height depends on it.
-        self.setVisible(fault is not None)
+        if fault is None:
+            self.show_text("")
+            return
+        text = f"{fault.reason} · {fault.at_utc}"
+        self.show_text(f"{text}\n{fault.remedy}" if fault.remedy else text)

@@ -7,8 +7,9 @@ from PySide6.QtGui import QResizeEvent
 from PySide6.QtWidgets import QFrame, QLabel, QSizePolicy, QWidget
 
 from escape_gui.theme import Theme
-from escape_gui.widgets.controls import Level, StatusIndicator, caption, flat_button, row
+from escape_gui.widgets.controls import QUALITY_LEVELS, Level, StatusIndicator, caption, flat_button, row
 from escape_hw.remote.state import Finish, State
+from escape_hw.report.verdict import assess
 
 #: Display time of a notification; errors stay until they are closed.
 DISPLAY_MS = 6000
@@ -55,6 +56,11 @@ class NotificationBar(QWidget):
         theme.changed.connect(lambda: self.setMinimumHeight(theme.pixels(26)))
         self._show_newest()
 
+    def close_messages(self, title: str) -> None:
+        """Remove the notifications of this title: their reason has passed."""
+        for one in [one for one in self.notifications if one.title == title]:
+            self._remove(one)
+
     def show_message(self, level: Level, title: str, text: str, *, persistent: bool | None = None) -> None:
         """Show a notification for :data:`DISPLAY_MS`; if ``persistent`` (default: errors), until closed."""
         while len(self.notifications) >= _MAX_NOTIFICATIONS:
@@ -86,6 +92,8 @@ class NotificationBar(QWidget):
         self._more.setToolTip("Older notifications" if others > 0 else "")
 
 
+#: Titles of notifications that are closed when their reason has passed.
+_LOST, _FAULT = "Server lost", "Fault, mirror made safe"
 _LEVELS = {Finish.DONE: Level.GOOD, Finish.ABORTED: Level.WARNING, Finish.FAILED: Level.ERROR}
 
 
@@ -103,17 +111,25 @@ class StateNotifier:
         self._state, self._connected = state, connected
         if was_connected and not connected:
             why = "Connection lost; reconnecting automatically."
-            self._bar.show_message(Level.ERROR, "Server lost", why, persistent=False)
+            self._bar.show_message(Level.ERROR, _LOST, why)
         if not connected:
             return
+        self._bar.close_messages(_LOST)
+        if state.fault is None:
+            self._bar.close_messages(_FAULT)
         if before is None or not was_connected:
             for notice in state.notes:
                 self._bar.show_message(Level.WARNING, "Startup notice", notice)
         if before is None:
             return
         if state.fault is not None and state.fault != before.fault:
-            self._bar.show_message(Level.ERROR, "Fault, mirror made safe", state.fault.reason)
+            self._bar.show_message(Level.ERROR, _FAULT, state.fault.reason)
         if state.last_run is not None and state.last_run != before.last_run:
             last = state.last_run
-            text = "\n".join(part for part in (last.message, last.folder) if part)
-            self._bar.show_message(_LEVELS[last.finish], f"{last.name} {last.finish.value}", text)
+            verdict = assess(last.document)
+            level = _LEVELS[last.finish]
+            if verdict is not None and last.finish is Finish.DONE:
+                level = QUALITY_LEVELS[verdict.quality]
+            parts = (last.message, "" if verdict is None else str(verdict), last.folder)
+            text = "\n".join(part for part in parts if part)
+            self._bar.show_message(level, f"{last.name} {last.finish.value}", text)

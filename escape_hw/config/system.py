@@ -74,14 +74,18 @@ class TrackingSection(Section):
 
 
 class ServerSection(Section):
-    """Limits of ``escape serve``. Exceeding any of them but ``lease_s`` makes the mirror safe."""
+    """Limits of ``escape serve``. Exceeding any of them but ``lease_s`` makes the mirror safe.
+
+    A run and a closed loop go on without a client in control, unless ``unattended_s`` limits it for runs.
+    """
 
     lease_s: float = Field(
         5.0, ge=1.5, le=600, description="a client with the write lease loses it after this silence, seconds"
     )
     unattended_s: float = Field(
-        10.0, ge=0.5, le=3600, description="a procedure without a lease holder is aborted after this, seconds"
-    )
+        0.0, ge=0, le=3600,
+        description="a procedure without a client in control is aborted after this, seconds; 0: it goes on",
+    )  # fmt: skip
     engine_silence_s: float = Field(
         10.0,
         ge=2,

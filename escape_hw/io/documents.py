@@ -94,6 +94,7 @@ def calibration_document(result: CalibrationResult) -> dict[str, Any]:
         "n_sub_apertures": result.grid.n_valid,
         **registration_document(result.registration),
         "snr": snr_document(result.measured or result.matrix),
+        "clipped_pokes": (result.measured or result.matrix).metrics.get("clipped_pokes"),
         "delay_frames": None if response is None else response.delay_frames,
         "response": None if response is None else {"weights": response.weights, "sigma": response.sigma},
         "partial": result.partial,

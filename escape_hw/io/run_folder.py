@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from datetime import datetime
 from pathlib import Path
 from types import TracebackType
@@ -35,6 +35,36 @@ def dated_folder(runs: Path, *names: str) -> Path:
     """Path of a new folder ``RUNS/DATE/TIME_NAME...`` in local time, since these names are for people."""
     now = datetime.now().astimezone()
     return runs / f"{now:%Y-%m-%d}" / "_".join((f"{now:%H%M%S}", *map(_sanitise_name, names)))
+
+
+#: Name of a folder of :func:`dated_folder`; a server appends the number of the run.
+_RUN_NAME = re.compile(r"(?P<time>\d{6})_(?P<system>.+)_(?P<kind>[^_]+?)(-(?P<number>\d+))?")
+
+
+def find_runs(runs: Path) -> Iterator[Path]:
+    """The dated run folders under ``runs``, the newest first."""
+    for day in sorted(runs.glob("[0-9]*-[0-9]*-[0-9]*"), reverse=True):
+        yield from sorted((one for one in day.glob("*_*") if one.is_dir()), reverse=True)
+
+
+def last_run_number(runs: Path, system: str) -> int:
+    """Largest number of a server's runs of a system under ``runs``; 0 if there is none."""
+    names = (_RUN_NAME.fullmatch(folder.name) for folder in find_runs(runs))
+    return max(
+        (int(name["number"]) for name in names if name and name["number"] and name["system"] == system),
+        default=0,
+    )
+
+
+def run_label(folder: Path) -> str:
+    """Name of a run for people: ``docrime-17`` for a server's run, else ``2026-11-22 214530 docrime``."""
+    name = _RUN_NAME.fullmatch(folder.name)
+    if name is None:
+        return folder.name
+    kind = name["kind"].removeprefix("calibrate-")
+    if name["number"]:
+        return f"{kind}-{name['number']}"
+    return f"{folder.parent.name} {name['time']} {kind}"
 
 
 class RunFolder:

@@ -90,6 +90,9 @@ class Lease(StateDocument):
     host: str
     pid: int
     since_utc: str
+    #: Seconds since its last message, and until it loses control if it stays silent.
+    silent_s: float = 0.0
+    expires_in_s: float = 0.0
 
 
 class DeviceState(StateDocument):
@@ -155,6 +158,7 @@ class LoopState(StateDocument):
     gain: float = 0.0
     leak: float = 0.0
     dropped_modes: int = 0
+    #: Number of controlled modes, without the dropped ones.
     n_modes: int = 0
     residual_nm: float = 0.0
     #: Running Strehl ratio (peak), with a science camera and a model PSF.
@@ -272,6 +276,10 @@ class State(StateDocument):
     #: Increases whenever the sensor's geometry changes.
     geometry_version: int = 0
     clients: int = 0
+    #: Seconds since a client had control; 0 while one has it, or if none ever had it.
+    unattended_for_s: float = 0.0
+    #: A procedure without a client in control is aborted after this, seconds; 0: it goes on.
+    unattended_limit_s: float = 0.0
     #: Messages that were refused: malformed, too large, without the lease.
     refused_requests: int = 0
     #: Findings at the start, such as a crash of the previous server or a run that can be resumed.

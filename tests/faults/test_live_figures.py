@@ -11,6 +11,7 @@ from escape_hw.calibration.acquisition import preview
 from escape_hw.calibration.acquisition.preview import MatrixPreview
 from escape_hw.calibration.docrime.closed_loop import docrime_closed_loop
 from escape_hw.calibration.docrime.open_loop import docrime_run
+from escape_hw.calibration.escape.short_runs import calibrate_short_run
 from escape_hw.calibration.optical_gain.bootstrap import bootstrap_gains
 from escape_hw.calibration.push_pull.modulation import modulation_demodulation
 from escape_hw.calibration.push_pull.procedure import push_pull
@@ -143,3 +144,13 @@ def test_pictures_take_a_small_share_of_the_time(monkeypatch):
         if pictures.is_due():
             assert pictures(slow)["matrix"].shape == (4, 3)
     assert 0.02 < sum(spent) / clock[0] < 0.05
+
+
+def test_a_run_too_short_for_a_matrix_has_live_maps(often):
+    with small(QUIET) as bench:
+        _, shown = watched(bench, calibrate_short_run(bench, frames=400))
+        matrix = bench.run(docrime_run(bench, frames=3000)).result.matrix
+    assert len(shown["matrix"]) >= 2
+    last, sigma = shown["matrix"][-1], shown["matrix_sigma"][-1]
+    assert last.shape == sigma.shape == matrix.data.shape
+    assert np.corrcoef(last.ravel(), matrix.data.ravel())[0, 1] > 0.5

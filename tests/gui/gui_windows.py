@@ -42,7 +42,7 @@ def show_window(
 
 def dispose(window: MainWindow) -> None:
     """Close and delete a window."""
-    window.close()
+    window.close_without_question()
     window.deleteLater()
 
 

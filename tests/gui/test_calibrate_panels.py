@@ -22,6 +22,7 @@ from escape_gui.panels.modes import LIVE_LABEL, ModesPanel
 from escape_gui.panels.procedure import ProcedurePanel
 from escape_gui.panels.sprint import SprintPanel
 from escape_gui.settings import Settings
+from escape_gui.widgets.controls import Level
 from escape_gui.widgets.mode_maps import best_columns
 from escape_hw.api.registration import TO_STREAM_UNITS
 from escape_hw.io.documents import calibration_document
@@ -367,3 +368,27 @@ def test_without_control_nothing_starts(session, source, control, calibrate):
     assert "take control" in panel.start.toolTip()
     assert panel.check.isEnabled()
     assert isinstance(control, ScriptedControl)
+
+
+def test_a_converged_fit_with_a_noisy_mode_is_not_green(calibrate, source):
+    estimate = fake.registration()
+    path = np.array([step.registration.to_array() for step in estimate.iterations])
+    source.push("registration", path * TO_STREAM_UNITS)
+    source.push("registration_sigma", estimate.sigma * TO_STREAM_UNITS)
+    source.push("step_norm", np.array([step.step_norm for step in estimate.iterations]))
+    document = {**calibration_document(fake.calibration("escape")), "snr": {"min": 0.35, "median": 9.0}}
+    document |= {"warnings": [], "clipped_pokes": 350, "frames": 1000}
+    source.change(last_run=FinishedRun(id=3, name="escape", finish=Finish.DONE, document=document))
+    look(calibrate)
+    sprint, procedure = calibrate.panels["sprint"], calibrate.panels["procedure"]
+    assert (sprint._indicator.level, sprint._indicator.text) == (Level.WARNING, "converged, 18 iterations")
+    line = "Usable: SNR 0.35 in the worst mode"
+    assert line in sprint._notes.text()
+    assert line in procedure.verdict.text()
+    assert "Pokes clipped: 35 % (350 of 1000)" in procedure.numbers.text()
+    calibrate.refresh()
+    source.change(last_run=FinishedRun(id=4, name="escape", finish=Finish.DONE, document=document))
+    calibrate.refresh()
+    told = calibrate.notifications.notifications[-1]
+    assert told.level is Level.WARNING
+    assert line in told.text

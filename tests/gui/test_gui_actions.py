@@ -84,12 +84,13 @@ def _reset(stage: Stage) -> None:
 #: Check of the effect of each action. The test of an action without a check fails.
 CHECKS: dict[str, Callable[[Stage], None]] = {
     "open_product": lambda s: s.refused("chosen.fits"),
+    "runs": lambda s: _is(s.window.run_browser.isVisible()),
     "open_run": lambda s: s.refused("saved"),
     "save_png": lambda s: s.saved("png"),
     "save_csv": _saved_csv,
     "save_fits": _saved_fits,
     "save_window": lambda s: s.saved("png"),
-    "quit": lambda s: s.bot.waitUntil(lambda: not s.window.isVisible()),
+    "quit": lambda s: s.bot.waitUntil(lambda: s.window.close_question is not None),
     "workspace_align": _workspace("align"),
     "workspace_calibrate": _workspace("calibrate"),
     "workspace_operate": _workspace("operate"),
@@ -108,6 +109,8 @@ CHECKS: dict[str, Callable[[Stage], None]] = {
     "take_control": lambda s: s.asked("acquire", take_over=True),
     "give_back": lambda s: s.asked("release"),
     "record": lambda s: s.asked("record", args=(True,)),
+    "alarms": lambda s: _is(s.window.alarm_dialog.isVisible()),
+    "acknowledge": lambda s: _is(s.window.alarms.unacknowledged == ()),
     "clear_fault": lambda s: s.asked("clear_fault"),
     "help_panel": lambda s: _is(s.window.overlay.isVisible() and "sensor" in s.window.overlay.page),
     "keys": lambda s: _is("Ctrl+Shift+F" in s.window.overlay.page),

@@ -11,8 +11,9 @@ import pytest
 from PySide6.QtCore import Qt
 from PySide6.QtGui import QGuiApplication
 from pytestqt.qtbot import QtBot
-from scripted import DEVICES, ScriptedControl, ScriptedSource, running, secondary
+from scripted import DEVICES, ScriptedSource, running, secondary
 
+from escape_gui.client.history import LoopHistory
 from escape_gui.client.session import Session
 from escape_gui.main_window import MainWindow
 from escape_gui.panels import PANELS
@@ -21,11 +22,9 @@ from escape_gui.panels.camera import CameraPanel
 from escape_gui.panels.devices import DevicesPanel, format_fact
 from escape_gui.panels.latency import LatencyPanel
 from escape_gui.panels.log import LogPanel
-from escape_gui.panels.loop import LoopPanel
 from escape_gui.panels.mirror import MirrorPanel
 from escape_gui.panels.performance import PerformancePanel
 from escape_gui.panels.psf import PsfPanel
-from escape_gui.widgets.controls import HOLD_MS
 from escape_hw.errors import StorageError
 from escape_hw.remote.state import (
     DeviceHealth,
@@ -44,7 +43,7 @@ MakeWindow = Callable[..., MainWindow]
 @pytest.fixture
 def window(make_window: MakeWindow) -> MainWindow:
     """A window with several panels."""
-    return make_window((DevicesPanel, CameraPanel, MirrorPanel, LoopPanel, PerformancePanel, LogPanel))
+    return make_window((DevicesPanel, CameraPanel, MirrorPanel, PerformancePanel, LogPanel))
 
 
 def panel_of(window: MainWindow, kind: type[P]) -> P:
@@ -166,72 +165,6 @@ def test_mirror_shows_peak_and_clipping(window: MainWindow, source: ScriptedSour
     assert [readouts[name].text for name in ("rms", "peak", "clipped")] == ["0.0812", "0.8000", "3.10"]
 
 
-def test_loop_edit_check_apply(
-    window: MainWindow, source: ScriptedSource, control: ScriptedControl, qtbot: QtBot
-) -> None:
-    loop = panel_of(window, LoopPanel)
-    assert not loop.apply_button.isEnabled()
-    loop.gain.setValue(0.5)
-    window.update_timer.tick(force=True)
-    assert control.asked == []
-    assert "press Check first" in loop.apply_button.toolTip()
-    loop.check_button.click()
-    assert loop.message.text() == "Apply: gain 0.425 → 0.5"
-    window.update_timer.tick(force=True)
-    loop.apply_button.click()
-    qtbot.waitUntil(lambda: loop.message.text() == "Done.")
-    assert control.asked == [("set_loop", {"gain": 0.5})]
-
-
-def test_loop_refuses_what_the_server_would(window: MainWindow, source: ScriptedSource) -> None:
-    loop = panel_of(window, LoopPanel)
-    loop.dropped_modes.setValue(94)
-    loop.gain.setValue(0.0)
-    loop.check()
-    assert "gain: Input should be greater than 0" in loop.message.text()
-    assert "94 of 94 leaves none to control" in loop.message.text()
-    window.update_timer.tick(force=True)
-    assert not loop.apply_button.isEnabled()
-
-
-def test_loop_form_keeps_an_edit_while_the_state_changes(window: MainWindow, source: ScriptedSource) -> None:
-    loop = panel_of(window, LoopPanel)
-    loop.leak.setValue(0.1)
-    source.change(loop=source.state.loop.model_copy(update={"gain": 0.6}))
-    window.update_timer.tick(force=True)
-    assert loop.current["gain"].text() == "0.6000"
-    assert (loop.leak.value(), loop.gain.value()) == (0.1, 0.425)
-    loop.revert_button.click()
-    assert (loop.leak.value(), loop.gain.value()) == (0.026, 0.6)
-
-
-def test_closing_the_loop_needs_a_held_button(
-    window: MainWindow, source: ScriptedSource, control: ScriptedControl, qtbot: QtBot
-) -> None:
-    loop = panel_of(window, LoopPanel)
-    assert "the loop is closed" in loop.close_button.toolTip()
-    source.change(phase=Phase.IDLE, loop=LoopState(gain=0.4, leak=0.02, dropped_modes=3, n_modes=80))
-    window.update_timer.tick(force=True)
-    qtbot.mouseClick(loop.close_button, Qt.MouseButton.LeftButton)
-    qtbot.wait(50)
-    assert control.asked == []
-    qtbot.mousePress(loop.close_button, Qt.MouseButton.LeftButton)
-    qtbot.waitUntil(lambda: bool(control.asked), timeout=20 * HOLD_MS)
-    qtbot.mouseRelease(loop.close_button, Qt.MouseButton.LeftButton)
-    assert control.asked == [("close_loop", {"args": ("escape", 0.4, 0.02, 3)})]
-
-
-def test_return_held_closes_the_loop_too(
-    window: MainWindow, source: ScriptedSource, control: ScriptedControl, qtbot: QtBot
-) -> None:
-    button = panel_of(window, LoopPanel).close_button
-    source.change(phase=Phase.IDLE, loop=LoopState(gain=0.4))
-    window.update_timer.tick(force=True)
-    qtbot.keyPress(button, Qt.Key.Key_Return)
-    qtbot.waitUntil(lambda: control.verbs == ["close_loop"], timeout=20 * HOLD_MS)
-    qtbot.keyRelease(button, Qt.Key.Key_Return)
-
-
 def test_log_search_level_and_copy(window: MainWindow, source: ScriptedSource) -> None:
     for k in range(1, 7):
         source.push_all(k)
@@ -246,26 +179,54 @@ def test_log_search_level_and_copy(window: MainWindow, source: ScriptedSource) -
     assert "message 4" in QGuiApplication.clipboard().text()
 
 
-def test_performance_has_gaps_while_hidden(window: MainWindow, source: ScriptedSource) -> None:
+def test_performance_goes_on_while_the_panel_is_hidden(window: MainWindow, source: ScriptedSource) -> None:
     panel = panel_of(window, PerformancePanel)
-    panel._last_state_s -= 60.0
-    source.change(loop=source.state.loop.model_copy(update={"residual_nm": 50.0}))
-    window.update_timer.tick(force=True)
+    window.show_workspace("align")
+    for residual in (50.0, 51.0):
+        source.change(loop=source.state.loop.model_copy(update={"residual_nm": residual}))
+        window.update_timer.tick(force=True)
+    window.show_workspace("operate")
     (table,) = panel.export_arrays()
-    assert np.isnan(table.data[-2, 1:]).all()
-    assert table.data[-1, 2] == 50.0
+    assert table.data[-3:, 2].tolist() == [44.0, 50.0, 51.0]
 
 
-def test_performance_has_gaps_where_the_loop_was_open(
-    window: MainWindow, source: ScriptedSource, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("escape_gui.panels.performance._GAP_S", np.inf)
+def test_performance_has_gaps_where_the_loop_was_open(window: MainWindow, source: ScriptedSource) -> None:
     panel = panel_of(window, PerformancePanel)
     source.change(loop=source.state.loop.model_copy(update={"closed": False}))
     window.update_timer.tick(force=True)
     (table,) = panel.export_arrays()
     assert table.data[-2, 1:] == pytest.approx([36.5, 44.0])
     assert np.isnan(table.data[-1, 1:]).all()
+
+
+def test_performance_survives_the_end_of_the_engine(window: MainWindow, source: ScriptedSource) -> None:
+    panel = panel_of(window, PerformancePanel)
+    source.fail("the engine died")
+    source.change(engine_pid=0)
+    window.update_timer.tick(force=True)
+    source.change(engine_pid=12, fault=None, phase=Phase.IDLE)
+    window.update_timer.tick(force=True)
+    assert not panel.shows_placeholder
+    (table,) = panel.export_arrays()
+    assert table.data[1, 1:] == pytest.approx([36.5, 44.0])
+
+
+def test_hours_of_performance_need_little_memory_and_are_shown_in_hours(
+    window: MainWindow, source: ScriptedSource
+) -> None:
+    seconds = iter(np.arange(0, 9 * 3600, 0.2))
+    history = LoopHistory(clock=lambda: float(next(seconds)))
+    loop = source.state.loop
+    for serial in range(9 * 3600 * 5):
+        history.update(State.model_construct(system="a", server_pid=1, serial=serial + 1, loop=loop))
+    times, _ = history.strehl.arrays
+    assert times.size >= 8 * 3600 * 5
+    assert sum(one.nbytes for one in vars(history.strehl).values() if hasattr(one, "nbytes")) < 10e6
+    panel = panel_of(window, PerformancePanel)
+    panel.span.choose("12 h")
+    panel.strehl.show_history(history.strehl, times[-1])
+    assert panel.strehl.getPlotItem().getAxis("bottom").labelText == "time before now [h]"
+    assert panel.strehl._line.getData()[0].size < 10_000
 
 
 def test_profiles_begin_at_the_strehl_ratio(make_window: MakeWindow, source: ScriptedSource) -> None:

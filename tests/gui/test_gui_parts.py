@@ -10,17 +10,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PySide6.QtCore import Qt
+from PySide6.QtTest import QTest
+from PySide6.QtWidgets import QApplication
 from pytestqt.qtbot import QtBot
 from scripted import ScriptedControl, disc, rows_of, secondary
 
 from escape_gui.app import require_display
+from escape_gui.client.history import TimeSeriesBuffer
 from escape_gui.client.session import EmptySource, Session
 from escape_gui.settings import Settings, load_settings, save_settings
 from escape_gui.theme import PALETTES, SCALES, Palette, Theme
 from escape_gui.views.images import MAP_GAP, ActuatorImage, RadialProfile, mask_from_rows, slope_map_pair
 from escape_gui.views.loop_form import LoopSettingsEdit
-from escape_gui.widgets.images import outline_points
-from escape_gui.widgets.plots import TimeSeriesBuffer
+from escape_gui.widgets.images import SEQUENTIAL_MAPS, ImageViewer, outline_points
 from escape_hw.cli.app import run
 from escape_hw.errors import ConfigError
 from escape_hw.remote.state import Geometry, LoopState
@@ -256,7 +259,9 @@ def test_a_system_and_an_address_are_refused(capsys: pytest.CaptureFixture[str])
     assert "not both" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(("display", "said"), [("", "ssh -X"), (":0", "apt install libxcb-cursor0")])
+@pytest.mark.parametrize(
+    ("display", "said"), [("", "ssh -X"), (":0", "apt install libxcb-cursor0 libxcb-icccm4")]
+)
 def test_without_a_display_the_message_names_the_remedy(
     monkeypatch: pytest.MonkeyPatch, display: str, said: str
 ) -> None:
@@ -278,3 +283,20 @@ def test_qt_keeps_its_references() -> None:
         "bell = Bell()\nfor _ in range(5000): bell.rung.emit(True)\n"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False, timeout=120).returncode == 0
+
+
+def test_a_double_click_resets_the_zoom_of_an_image(qapp: QApplication) -> None:
+    image = ImageViewer(Theme(), "image", SEQUENTIAL_MAPS)
+    image.resize(300, 300)
+    image.show()
+    image.show_array(np.zeros((40, 40)))
+    QApplication.processEvents()
+    whole = image.box.viewRect()
+    image.box.setRange(xRange=(5, 10), yRange=(5, 10))
+    assert image.box.viewRect().width() < 0.5 * whole.width()
+    place = image.view.viewport().rect().center()
+    QTest.mouseDClick(image.view.viewport(), Qt.MouseButton.LeftButton, pos=place)
+    QApplication.processEvents()
+    assert image.box.viewRect().width() == pytest.approx(whole.width())
+    image.close()
+    image.deleteLater()

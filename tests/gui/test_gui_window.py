@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from gui_windows import dispose, settle, show_window
 from PySide6.QtCore import QPoint, Qt
+from PySide6.QtTest import QTest
 from PySide6.QtWidgets import (
     QAbstractButton,
     QAbstractSpinBox,
@@ -35,6 +36,7 @@ from escape_hw.remote.state import (
     Finish,
     FinishedRun,
     FrameCounters,
+    Phase,
     ProcedureEntry,
     ProcedureParameter,
 )
@@ -118,8 +120,8 @@ def test_a_fault_stays_until_it_is_cleared(
     source.fail("no frames for 0.5 s")
     window.refresh()
     assert window.fault_banner.isVisible()
-    assert "no frames for 0.5 s" in window.fault_banner._text.text()
-    assert "cable" in window.fault_banner._text.text()
+    assert "no frames for 0.5 s" in window.fault_banner.text.text()
+    assert "cable" in window.fault_banner.text.text()
     assert window.notifications.notifications[-1].title == "Fault, mirror made safe"
     source.change(fault=None)
     window.refresh()
@@ -273,13 +275,67 @@ def test_a_broken_panel_does_not_stop_the_others(
 
 def test_frozen_panels_stop_but_the_header_updates(small_window: MainWindow, source: ScriptedSource) -> None:
     window = small_window
-    window.toggle_freeze()
+    assert not window.frozen_banner.isVisible()
+    QTest.keyClick(window, Qt.Key.Key_X)
+    assert window.frozen_banner.isVisible()
+    assert "The panels show the data of " in window.frozen_banner.text.text()
     before = window.panels["camera"].image_view.data
     source.push_all(2)
     source.change(rates=source.state.rates.model_copy(update={"frame_hz": 123.4}))
     window.update_timer.tick(force=True)
     assert window.panels["camera"].image_view.data is before
     assert window.header.readouts["rate"].text == "123.4"
+    QTest.mouseClick(window.frozen_banner.button, Qt.MouseButton.LeftButton)
+    assert not window.frozen_banner.isVisible()
+    assert not window.update_timer.frozen
+
+
+def test_after_the_end_of_the_engine_nothing_stale_is_shown(
+    make_window: MakeWindow, source: ScriptedSource
+) -> None:
+    window = make_window()
+    source.fail("the engine (process 11) died")
+    source.change(engine_pid=0, streams=())
+    window.update_timer.tick(force=True)
+    header = window.header
+    assert header.phase.text == "fault"
+    assert {one.text for one in header.readouts.values()} == {"–"}
+    assert header.saturation.text == "saturated –"
+    window.show_workspace("calibrate")
+    window.update_timer.tick(force=True)
+    loop, procedure = window.panels["loop"], window.panels["procedure"]
+    loop.on_state(source.state)
+    loop.tick(source)
+    for button in (loop.close_button, procedure.start, procedure.check, window.actions_by_name["record"]):
+        assert not button.isEnabled()
+        assert "the engine has ended; clear the fault to start it again" in button.toolTip()
+    assert window.actions_by_name["clear_fault"].isEnabled()
+
+
+def test_notifications_are_closed_when_their_reason_has_passed(
+    small_window: MainWindow, source: ScriptedSource
+) -> None:
+    window = small_window
+    source.fail()
+    window.refresh()
+    source.connected = False
+    window.refresh()
+    titles = [one.title for one in window.notifications.notifications]
+    assert titles == ["Fault, mirror made safe", "Server lost"]
+    source.connected = True
+    source.change(fault=None, phase=Phase.IDLE)
+    window.refresh()
+    assert window.notifications.notifications == []
+
+
+def test_equal_log_lines_are_collapsed(small_window: MainWindow, source: ScriptedSource) -> None:
+    window = small_window
+    for _ in range(3):
+        source.push_all(1)
+    window.update_timer.tick(force=True)
+    lines = window.panels["log"].text.toPlainText().splitlines()
+    assert len(lines) == 2
+    assert lines[-1].endswith("residual 44 nm (× 3)")
 
 
 def test_layout_and_theme_are_saved(make_window: MakeWindow, tmp_path: Path) -> None:
@@ -289,7 +345,7 @@ def test_layout_and_theme_are_saved(make_window: MakeWindow, tmp_path: Path) -> 
     window.show_workspace("align")
     window.toggle_theme()
     window.context.theme.step_scale(+1)
-    window.close()
+    window.close_without_question()
     settings, warnings = load_settings(settings_path)
     assert warnings == ()
     window = make_window(settings=settings)
@@ -335,7 +391,9 @@ def test_nothing_of_the_header_is_cut_off(make_window: MakeWindow, scale: float)
     header = window.header
     for widget in (*header.readouts.values(), header.phase, header.loop, header.saturation, header.control):
         assert widget.width() >= widget.sizeHint().width()
-        assert widget.geometry().right() < header.open_button.geometry().left()
+        right = widget.mapTo(header, widget.rect().topRight()).x()
+        assert widget.isVisible()
+        assert right < header.open_button.geometry().left()
 
 
 def test_a_window_without_a_source_starts(tmp_path: Path) -> None:

@@ -109,10 +109,29 @@ def test_the_slider_moves_through_the_run(empty, folder):
     assert playback_bar.isVisible()
     playback_bar.slider.setValue(playback_bar.slider.maximum() // 2)
     until(lambda: len(sprint._history.values) == 9, empty)
+    assert sprint._indicator.text == "running, 9 iterations"
+    assert playback_bar.position_label.text().strip() == "step 250 of 500"
     playback_bar.slider.setValue(playback_bar.slider.maximum() - 2)
     playback_bar.play.click()
     until(lambda: not playback_bar.play.isChecked(), empty)
     until(lambda: len(sprint._history.values) == 18, empty)
+    until(lambda: sprint._indicator.text == "converged, 18 iterations", empty)
+
+
+def test_a_recorded_run_is_not_taken_for_the_bench(small_window, folder):
+    small_window.show_recording(ReplaySource(folder))
+    (other,) = small_window.replay_windows
+    other.update_timer.tick(force=True)
+    assert other.windowTitle() == f"REPLAY · {folder.name} · ESCAPE"
+    assert "REPLAY OF A RECORDED RUN" in other.header.connection_banner.text()
+    colour = other.context.theme.colours.replay
+    assert colour in other.header.connection_banner.styleSheet()
+    assert colour in other.styleSheet()
+    assert not other.header.flatten_button.isVisible()
+    assert other.pos() != small_window.pos()
+    assert small_window.header.flatten_button.isVisible()
+    small_window.refresh()
+    assert "REPLAY" not in small_window.windowTitle()
 
 
 @pytest.mark.parametrize("name", ["", "escape.fits"])

@@ -316,7 +316,28 @@ def test_two_clients_race_for_the_lease_a_thousand_times(served: Served, bench: 
     assert sorted(won["one"] + won["other"]) == list(range(1000))
 
 
-def test_a_run_whose_holder_vanished_is_aborted_and_the_fault_latched(system: Path, tmp_path: Path) -> None:
+def test_a_run_whose_holder_vanished_goes_on_and_control_is_free(system: Path, tmp_path: Path) -> None:
+    with (
+        serving(system, "--set", "server.lease_s=1.5", folder=tmp_path) as served,
+        served.connect() as watcher,
+    ):
+        holder = served.connect(control=True)
+        until_idle(watcher)
+        run = holder.start("docrime", frames=20_000)
+        wait_for(lambda: watcher.state.mirror.peak > 0, "pokes")
+        holder._link.close()  # as after the kill of a window
+        wait_for(lambda: watcher.state.lease is None, "control is free")
+        before = watcher.state.active_run
+        assert before is not None
+        assert watcher.state.unattended_limit_s == 0
+        wait_for(lambda: watcher.state.unattended_for_s > 0.5, "the time without an operator")
+        watcher.acquire()
+        wait_for(lambda: watcher.state.last_run is not None, "the end of the run")
+        assert (watcher.state.last_run.id, watcher.state.last_run.finish) == (run.id, Finish.DONE)
+        assert watcher.state.fault is None
+
+
+def test_a_run_whose_holder_vanished_is_aborted_after_the_limit(system: Path, tmp_path: Path) -> None:
     limits = ("--set", "server.lease_s=1.5", "--set", "server.unattended_s=1")
     with serving(system, *limits, folder=tmp_path) as served, served.connect() as watcher:
         holder = served.connect(control=True)

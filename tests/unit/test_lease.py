@@ -98,3 +98,11 @@ def test_too_many_are_refused_until_some_are_forgotten(book: LeaseManager, clock
     book.expire()
     assert book.count == 0
     comes(book, MAX_CLIENTS)
+
+
+def test_the_lease_states_the_silence_of_its_holder(book: LeaseManager, clock: Clock) -> None:
+    book.acquire(comes(book, 1), take_over=False)
+    clock.now += 3.5
+    lease = book.lease
+    assert lease is not None
+    assert (lease.silent_s, lease.expires_in_s) == (3.5, 1.5)

@@ -256,3 +256,10 @@ def test_a_mirror_on_the_network_is_found_at_a_given_host(document) -> None:
     assert "emulated" in mirror["model"]
     assert f"port = {where.rpartition(':')[2]}" in mirror["toml"]
     assert "disabled = [248, 249" in mirror["toml"]
+
+
+def test_missing_libraries_of_the_window_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ctypes.util.find_library", lambda name: None if name == "xcb-icccm" else name)
+    finding = levels(tmp_path)["window"]
+    assert (finding.level, finding.text) == ("warning", "Qt misses libxcb-icccm4")
+    assert finding.remedy == "apt install libxcb-icccm4"

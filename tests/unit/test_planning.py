@@ -8,10 +8,13 @@ import numpy as np
 import pytest
 from small_system import SMALL
 
+from escape_hw.api.procedure import run
 from escape_hw.bench import Bench
 from escape_hw.calibration.acquisition.pokes import RandomPokes, compute_poke_amplitudes
+from escape_hw.calibration.docrime.open_loop import docrime
 from escape_hw.calibration.modes.bases import build_modal_basis
 from escape_hw.config.loader import load_system
+from escape_hw.io.documents import calibration_document
 from escape_hw.server.engine.procedures import ProcedurePlanner
 
 
@@ -41,15 +44,29 @@ def test_pokes_in_turn_reach_less_than_all_at_once(bench: Bench) -> None:
     assert planner.plan("push-pull-fast", asked).stroke < 0.7 * planner.plan("docrime", asked).stroke
 
 
-def test_shortened_frames_are_counted_before_they_happen() -> None:
-    free = (*SMALL, "calibration.poke_command=1.0")
-    with Bench.from_config(load_system("razor-shwfs", overrides=free)) as bench:
-        limit = bench.dm.limits.max_stroke
-        # A poke of which some frames, not all, pass the limit.
-        poke = 0.02 * limit / float(np.quantile(np.abs(commands(bench, 0.02)).max(axis=1), 0.85))
-        share = float((np.abs(commands(bench, poke)).max(axis=1) > limit).mean())
-        told = ProcedurePlanner(bench).plan("docrime", {"frames": 400, "poke": poke})
-    (warning,) = told.warnings
-    assert "% of the frames" in warning
-    assert 0.5 * share < float(warning.split()[1]) / 100 < 2 * share
-    assert told.stroke <= limit
+@pytest.mark.parametrize(
+    ("limits", "poke"),
+    [
+        (("devices.dm.limits.max_slew=0.2",), 0.005),
+        (("devices.dm.limits.max_neighbour=0.25",), 0.005),
+        (("calibration.poke_command=1.0",), 0.02),
+    ],
+    ids=["slew", "neighbours", "stroke"],
+)
+def test_the_share_of_clipped_pokes_is_that_of_the_run(limits: tuple[str, ...], poke: float) -> None:
+    with Bench.from_config(load_system("razor-shwfs", overrides=(*SMALL, *limits))) as bench:
+        plan = ProcedurePlanner(bench).plan("docrime", {"frames": 600, "poke": poke})
+        result = run(docrime(bench, frames=600, poke=poke))
+    share = result.matrix.metrics["clipped_pokes"] / 600
+    assert 0.02 < share < 0.98, "some pokes are clipped, not all"
+    (warning,) = plan.warnings
+    assert "pokes clipped" in warning
+    assert float(warning.split()[1]) / 100 == pytest.approx(share, abs=0.08)
+    assert calibration_document(result)["clipped_pokes"] == result.matrix.metrics["clipped_pokes"]
+    assert plan.stroke <= bench.config.devices.dm.limits.max_stroke
+
+
+def test_the_model_psf_takes_the_time_of_the_science_camera(bench: Bench) -> None:
+    plan = ProcedurePlanner(bench).plan("model-psf", {"frames": 20})
+    assert bench.science is not None
+    assert plan.seconds == pytest.approx(20 / bench.science.settings.frame_rate_hz, rel=0.05)

@@ -124,3 +124,13 @@ def test_damaged_result_is_refused_by_name(home, content):
         (home / "result.json").write_text(content)
     with pytest.raises(ProductError, match=r"result\.json: "):
         read_result(home)
+
+
+def test_numbers_of_runs_continue_those_of_the_folder(home):
+    runs = home / "runs"
+    for name in ("214530_small_calibrate-escape-7", "214600_other_docrime-12", "214700_small_push-pull"):
+        (runs / "2026-11-21" / name).mkdir(parents=True)
+    assert run_folder.last_run_number(runs, "small") == 7
+    assert run_folder.last_run_number(home / "none", "small") == 0
+    labels = [run_folder.run_label(folder) for folder in run_folder.find_runs(runs)]
+    assert labels == ["2026-11-21 214700 push-pull", "docrime-12", "escape-7"]

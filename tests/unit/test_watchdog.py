@@ -80,6 +80,16 @@ def test_no_frames_in_closed_loop(engine: Engine) -> None:
     assert "camera" in violation.remedy
 
 
+def test_a_loop_may_compile_its_code_at_the_first_frames(engine: Engine) -> None:
+    assert engine.tell(1, closed=False) is None
+    assert engine.tell(20, frames=0, run=3) is None
+    assert engine.tell(1, frames=20, run=3) is None
+    assert engine.tell(20, frames=0, run=3) is None
+    violation = engine.tell(60, frames=0, run=3)
+    assert violation is not None
+    assert "no frame for 60" in violation.reason
+
+
 def test_no_frames_while_nothing_is_closed_is_no_fault(engine: Engine) -> None:
     assert engine.tell(600, closed=False, frames=0) is None
     assert engine.tell(1.0) is None

@@ -92,8 +92,8 @@ def require_identity(name: str, expected: ExpectedMirror, welcome: Welcome) -> N
     if welcome.last_command_m.size != n_act:
         raise DeviceError(
             name,
-            f"has {welcome.last_command_m.size} actuators, devices.{name}.layout = {shorten(expected.layout)!r} has "
-            f"{n_act}; correct the layout or the address",
+            f"has {welcome.last_command_m.size} actuators, devices.{name}.layout = "
+            f"{shorten(expected.layout)!r} has {n_act}; correct the layout or the address",
         )
     if expected.serial != welcome.serial:
         raise DeviceError(

@@ -108,6 +108,6 @@ def layout_of(device: str, n_act: int) -> str:
             return f"circle-{rows}"
     raise DeviceError(
         device,
-        f"has {n_act} actuators, and no layout 'circle-N', 'maps-336' or 'rings-672' has so many; give its layout "
-        "(layout='square-N', or a system file)",
+        f"has {n_act} actuators, and no layout 'circle-N', 'maps-336' or 'rings-672' has so many; give its "
+        "layout (layout='square-N', or a system file)",
     )

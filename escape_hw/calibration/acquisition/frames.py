@@ -57,16 +57,19 @@ class FluxMonitor:
             )
 
 
-def limit_to_reachable(dm: DeformableMirror, shape: NDArray[np.float64]) -> NDArray[np.float64]:
+def limit_to_reachable(
+    dm: DeformableMirror, shape: NDArray[np.float64], now: NDArray[np.float64] | None = None
+) -> NDArray[np.float64]:
     """Shorten a command as a whole until the mirror accepts it at once.
 
     The shape is scaled to obey the stroke limits, and the step to it is shortened to obey the slew limit.
     What is sent then stays in the span of the modes that the shape and the present shape consist of. The
     guard would clip single actuators instead, and the rest would be taken for a response of the modes.
 
-    ``shape``: command ``(n_act,)``.
+    ``shape``: command ``(n_act,)``; ``now``: shape from which the step is made, by default the present one.
     """
-    now, target = dm.shape, shape * dm.largest_legal_scale(shape)
+    now = dm.shape if now is None else now
+    target = shape * dm.largest_legal_scale(shape)
     slew, furthest = dm.limits.max_slew, float(np.abs(target - now).max(initial=0.0))
     if slew is None or furthest <= slew:
         return target

@@ -18,6 +18,28 @@ MAX_TIME_FRACTION = 0.04
 MatrixEstimate = tuple[NDArray[np.floating], NDArray[np.floating]] | None
 
 
+#: Largest delay of the slopes after a poke that :func:`correlate_pokes` tries, and least number of frames.
+_MAX_LAG, _MIN_FRAMES = 4, 50
+
+
+def correlate_pokes(slopes: NDArray[np.floating], pokes: NDArray[np.floating]) -> MatrixEstimate:
+    """Matrix from the correlation of the slopes with the pokes some frames before, for display.
+
+    The delay with the largest correlation is taken. Neither the turbulence nor the correlations between the
+    pokes are removed.
+
+    ``slopes``: ``(n_frames, n_slopes)``; ``pokes``: ``(n_frames, n_modes)``.
+    """
+    if len(slopes) < _MIN_FRAMES:
+        return None
+    centred = slopes - slopes.mean(axis=0)
+    power = np.maximum(np.square(pokes).sum(axis=0), 1e-30)
+    products = [centred[lag:].T @ pokes[: len(pokes) - lag] for lag in range(_MAX_LAG + 1)]
+    strongest = max(products, key=lambda one: float(np.square(one / np.sqrt(power)).sum()))
+    sigma = centred.std(axis=0)[:, None] / np.sqrt(power)
+    return strongest / power, sigma
+
+
 class MatrixPreview:
     """Limits how often an estimate is previewed, and arranges it for display.
 

@@ -14,7 +14,7 @@ from escape_hw.api.procedure import Procedure, Reporter
 from escape_hw.api.sensor import SensorGeometry, SlopeFunction, SubApertureGrid
 from escape_hw.bench import Bench
 from escape_hw.calibration.acquisition.frames import FluxMonitor, limit_to_reachable, next_frame
-from escape_hw.calibration.acquisition.preview import MatrixPreview
+from escape_hw.calibration.acquisition.preview import MatrixEstimate, MatrixPreview, correlate_pokes
 from escape_hw.calibration.acquisition.sensor_setup import (
     build_sensor_setup,
     build_slope_function,
@@ -143,9 +143,15 @@ class OpenLoopAcquisition:
         return False
 
     def _preview_arrays(self, preview: MatrixPreview) -> Mapping[str, NDArray[np.float32]] | None:
-        if self._sensor is None or self._sensor.estimator is None or not preview.is_due():
+        if self._sensor is None or not preview.is_due():
             return None
-        return preview(self._sensor.estimator.preview)
+        estimator = self._sensor.estimator
+        return preview(self._correlate_record if estimator is None else estimator.preview)
+
+    def _correlate_record(self) -> MatrixEstimate:
+        """Estimate for display in a run that is too short for a matrix."""
+        record = self.record()
+        return None if record is None else correlate_pokes(record[1], record[2])
 
     def _check_progress(self, final: bool = False) -> Procedure[bool]:
         """Save the state and evaluate the criterion, if due; whether the criterion is met."""

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import ctypes.util
 import importlib.metadata
+import importlib.util
 import os
 import re
 import shutil
@@ -63,6 +65,7 @@ def check_computer(
     hardware = _hardware_sections(config)
     return [
         *_check_packages(),
+        *_check_window(),
         *_check_libraries(hardware),
         *_check_permissions(host, hardware),
         *_check_usb(host, hardware),
@@ -108,6 +111,30 @@ def _check_packages() -> Iterator[Finding]:
         except importlib.metadata.PackageNotFoundError:
             yield Finding(f"package {name}", "error", "not installed", f"pip install {name}")
     yield Finding("packages", "ok", ", ".join(versions))
+
+
+#: Libraries that Qt needs for a display (X11), and their packages of Debian and Ubuntu.
+QT_LIBRARIES = {
+    "xcb-cursor": "libxcb-cursor0", "xcb-icccm": "libxcb-icccm4", "xcb-image": "libxcb-image0",
+    "xcb-keysyms": "libxcb-keysyms1", "xcb-render-util": "libxcb-render-util0",
+    "xkbcommon-x11": "libxkbcommon-x11-0",
+}  # fmt: skip
+
+
+def missing_qt_libraries() -> tuple[str, ...]:
+    """Packages of the libraries that Qt does not find on this computer."""
+    return tuple(package for name, package in QT_LIBRARIES.items() if ctypes.util.find_library(name) is None)
+
+
+def _check_window() -> Iterator[Finding]:
+    if importlib.util.find_spec("PySide6") is None:
+        yield Finding("window", "info", "PySide6 is not installed", "pip install 'escape-hw[gui]'")
+        return
+    missing = missing_qt_libraries()
+    yield _judge(
+        "window", not missing, f"Qt misses {', '.join(missing)}" if missing else "Qt has its libraries",
+        f"apt install {' '.join(missing)}",
+    )  # fmt: skip
 
 
 # --------------------------------------------------------------------- vendor libraries

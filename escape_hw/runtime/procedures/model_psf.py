@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from escape_hw.runtime.procedures.declaration import ProcedureSpec, SavedRun, parameter
 
@@ -52,6 +54,15 @@ class ModelPsfProcedure(ProcedureSpec[ModelPsf]):
     frames: int = parameter(
         default=MODEL_PSF_FRAMES, help="Science frames to average.", unit="frame", low=1, high=1e8
     )
+
+    @classmethod
+    def planned_frames(cls, bench: Bench, arguments: Mapping[str, Any]) -> int:
+        """Sensor frames that pass while the science camera takes its frames."""
+        frames = int(arguments.get("frames") or 0)
+        if bench.science is None:
+            return frames
+        ratio = bench.wfs.settings.frame_rate_hz / bench.science.settings.frame_rate_hz
+        return math.ceil(frames * ratio)
 
     def procedure(self, bench: Bench, folder: RunFolder | None) -> Procedure[ModelPsf]:
         """Average science frames, the phase screen out of the beam."""

@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from escape_hw.config.loader import load_text
+from escape_hw.io.run_folder import last_run_number
 from escape_hw.remote.state import State
 from escape_hw.runtime.session.system import System
 from escape_hw.server.engine.bench_owner import BenchOwner
@@ -35,7 +36,9 @@ class Engine:
         self._failure: Exception | None = None
         config = load_text(setup.config_text)
         bench = System.from_config(config)
-        state = self._state = EngineState(LoopParameters.from_config(config), setup.first_run_id)
+        # Names of runs and matrices are those of this folder, also of earlier servers.
+        first_run_id = max(setup.first_run_id, last_run_number(setup.runs, config.system.name) + 1)
+        state = self._state = EngineState(LoopParameters.from_config(config), first_run_id)
         publisher = self._publisher = StreamPublisher(config.system.name)
         store = ProductStore((setup.runs, *setup.read_folders))
         recording = self._recording = TelemetryRecording(setup.runs, publisher)

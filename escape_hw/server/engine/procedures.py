@@ -8,9 +8,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import norm
 
-from escape_hw.calibration.acquisition.pokes import compute_poke_amplitudes
+from escape_hw.calibration.acquisition.frames import limit_to_reachable
+from escape_hw.calibration.acquisition.pokes import (
+    PokeSequence,
+    PushPullPokes,
+    compute_poke_amplitudes,
+    compute_random_amplitudes,
+    select_random_pokes,
+)
 from escape_hw.calibration.docrime.open_loop import minimum_frames
 from escape_hw.calibration.modes.bases import build_modal_basis
 from escape_hw.config.system import SystemConfig
@@ -103,10 +109,8 @@ def needs_loop(name: str, arguments: Arguments) -> bool:
     return find_procedure(name).works_in_closed_loop(arguments)
 
 
-#: Standard deviations of the sum of random pokes that some actuator reaches in a run.
-_PEAK_SIGMAS = 4.0
-#: Fraction of the frames whose pokes are clipped by the limits, above which the plan warns.
-_CLIPPED_WARNING_SHARE = 0.05
+#: Number of random pokes that are simulated for a plan, and share of clipped pokes above which it warns.
+_SIMULATED_POKES, _CLIPPED_WARNING_SHARE = 1000, 0.01
 
 
 class ProcedurePlanner:
@@ -120,33 +124,48 @@ class ProcedurePlanner:
         """The plan of a procedure; ``arguments`` are complete (EscapeError: no modal basis)."""
         rate = self._bench.wfs.settings.frame_rate_hz
         procedure = find_procedure(name)
-        frames, random_pokes = procedure.planned_frames(self._bench, arguments), procedure.random_pokes
-        poke_per_mode = self._poke_per_mode(arguments)
+        frames = procedure.planned_frames(self._bench, arguments)
+        stroke, clipped_share = self._simulate_pokes(name, arguments)
         return ProcedurePlan(
-            name=name, arguments=dict(arguments), frames=frames, seconds=frames / rate,
-            stroke=min(_peak_command(random_pokes, poke_per_mode), self._bench.dm.limits.max_stroke),
-            warnings=tuple(self._warnings(name, arguments, random_pokes, poke_per_mode)),
+            name=name, arguments=dict(arguments), frames=frames, seconds=frames / rate, stroke=stroke,
+            warnings=tuple(self._warnings(name, arguments, clipped_share)),
         )  # fmt: skip
 
-    def _poke_per_mode(self, arguments: Arguments) -> NDArray[np.float64]:
-        """Largest poke of every actuator by every mode ``(n_act, n_modes)``, fraction of full stroke."""
+    def _simulate_pokes(self, name: str, arguments: Arguments) -> tuple[float, float]:
+        """Largest command of a run, and share of its pokes that the limits clip, from a simulated sequence.
+
+        Pokes are drawn and limited as in a run, from a flat mirror; in closed loop the command of the loop
+        adds to them.
+        """
         poke = arguments.get("poke")
         if poke is None:
-            return np.zeros((0, 0))
+            return 0.0, 0.0
+        bench, dm = self._bench, self._bench.dm
         if self._m2c is None:
-            self._m2c = build_modal_basis(self._bench)
-        return np.abs(self._m2c * compute_poke_amplitudes(self._bench, self._m2c, float(poke)))
+            self._m2c = build_modal_basis(bench)
+        m2c, rng = self._m2c, np.random.default_rng(1)
+        source: PokeSequence
+        if find_procedure(name).random_pokes:
+            amplitude = compute_random_amplitudes(bench, m2c, float(poke))
+            kind = arguments.get("pokes") or bench.config.calibration.pokes
+            source, count = select_random_pokes(str(kind))(amplitude, rng), _SIMULATED_POKES  # type: ignore[arg-type]
+        else:
+            source = PushPullPokes(compute_poke_amplitudes(bench, m2c, float(poke)), rng)
+            count = 2 * m2c.shape[1]
+        sent, peak, clipped = dm.flat, 0.0, 0
+        for _ in range(count):
+            requested = m2c @ source()
+            sent = limit_to_reachable(dm, requested, sent)
+            peak = max(peak, float(np.abs(sent).max()))
+            clipped += not np.array_equal(requested, sent)
+        return peak, clipped / count
 
-    def _warnings(
-        self, name: str, arguments: Arguments, random_pokes: bool, poke_per_mode: NDArray[np.float64]
-    ) -> list[str]:
+    def _warnings(self, name: str, arguments: Arguments, clipped_share: float) -> list[str]:
         bench, found = self._bench, []
-        limit = bench.dm.limits.max_stroke
-        share = _clipped_frames_bound(random_pokes, poke_per_mode, limit)
-        if share > _CLIPPED_WARNING_SHARE:
+        if clipped_share > _CLIPPED_WARNING_SHARE:
             found.append(
-                f"in {100 * share:.2g} % of the frames the pokes would exceed {limit:g} of the stroke; "
-                "such a command is scaled down as a whole, and the estimator uses the scaled pokes"
+                f"about {100 * clipped_share:.2g} % of the pokes clipped: they exceed a limit of the mirror "
+                "and are scaled down as a whole; the estimator uses the scaled pokes"
             )
         frames = int(arguments.get("frames") or 0)
         least = minimum_frames(bench.config.calibration, bench.config.basis.n_modes)
@@ -157,30 +176,3 @@ class ProcedurePlanner:
         if arguments.get("snr") is not None or arguments.get("accuracy") is not None:
             found.append("the run stops earlier if the target is reached")
         return found
-
-
-def _command_std(poke_per_mode: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Standard deviation of every actuator's command when all modes are poked at once ``(n_act,)``.
-
-    Uniform pokes of amplitude ``a`` have the standard deviation ``a / sqrt(3)``.
-    """
-    return np.asarray(np.sqrt(np.square(poke_per_mode).sum(axis=1) / 3), np.float64)
-
-
-def _peak_command(random_pokes: bool, poke_per_mode: NDArray[np.float64]) -> float:
-    """Largest command of an actuator in a run, before clipping, fraction of full stroke."""
-    if not poke_per_mode.size:
-        return 0.0
-    if not random_pokes:
-        return float(poke_per_mode.max())
-    return float(np.minimum(_PEAK_SIGMAS * _command_std(poke_per_mode), poke_per_mode.sum(axis=1)).max())
-
-
-def _clipped_frames_bound(random_pokes: bool, poke_per_mode: NDArray[np.float64], limit: float) -> float:
-    """Upper bound of the share of frames in which an actuator exceeds the limit (union bound)."""
-    if not poke_per_mode.size or _peak_command(random_pokes, poke_per_mode) <= limit:
-        return 0.0
-    if not random_pokes:
-        return 1.0
-    command_std = _command_std(poke_per_mode)
-    return float(min(1.0, 2 * norm.sf(limit / command_std[command_std > 0]).sum()))

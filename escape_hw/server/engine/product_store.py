@@ -50,7 +50,7 @@ class ProductStore:
         return self.add(self.readable_path(path), name)
 
     def add(self, path: Path, name: str | None = None) -> ProductEntry:
-        """Add a file under a name, by default its own; a product of the same name is replaced.
+        """Add a file under a name, by default its own; a number is appended if another file has that name.
 
         ProductError: the file cannot be read, is damaged, or of another kind.
         """
@@ -61,10 +61,18 @@ class ProductStore:
             raise ProductError(f"{path}: a product of kind '{kind}'; a server loads {', '.join(_KINDS)}")
         word, summary = describe(path)
         valid_name = re.sub(r"[^\w .+@:-]", "-", path.stem if name is None else name)[:80]
+        valid_name = self._free_name(valid_name, path)
         product = ProductEntry(name=valid_name, kind=word, path=str(path), summary=summary)
         self._products.pop(valid_name, None)
         self._products[valid_name] = product
         return product
+
+    def _free_name(self, name: str, path: Path) -> str:
+        """The name, or with the first number that makes it differ from those of other files."""
+        names = (name, *(f"{name}-{number}" for number in range(2, len(self._products) + 3)))
+        return next(
+            one for one in names if one not in self._products or self._products[one].path == str(path)
+        )
 
 
 def _matrix(path: Path) -> tuple[str, str]:

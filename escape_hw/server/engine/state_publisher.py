@@ -67,7 +67,7 @@ class StatePublisher:
         self._clock = clock
         self._emit_lock = threading.Lock()
         self._last: tuple[float, Frame | None] = (0.0, None)
-        self._rate, self._lost = 0.0, 0
+        self._rate, self._lost, self._counted_frames = 0.0, 0, 0
         self._clipped: deque[tuple[float, int, int]] = deque()
         self._thread: BackgroundThread | None = None
 
@@ -112,25 +112,28 @@ class StatePublisher:
 
     def _loop(self, now: EngineSnapshot) -> LoopState:
         loop, residual = now.loop, self._publisher.residual_nm
+        n_modes = max(0, self._bench.config.basis.n_modes - loop.dropped_modes)
         return LoopState(
             closed=now.loop_closed, matrix=loop.matrix, gain=loop.gain, leak=loop.leak,
-            dropped_modes=loop.dropped_modes, n_modes=self._bench.config.basis.n_modes,
+            dropped_modes=loop.dropped_modes, n_modes=n_modes,
             residual_nm=residual if now.loop_closed and math.isfinite(residual) else 0.0,
             strehl=_finite_metric(now.loop_statistics, "strehl"),
             strehl_sigma=_finite_metric(now.loop_statistics, "strehl_sigma"),
         )  # fmt: skip
 
     def _frame_counters(self, frame: Frame | None, engine: EngineSnapshot) -> FrameCounters:
-        now, (at, before) = self._clock(), self._last
+        now, (at, before), frames = self._clock(), self._last, self._publisher.frames
         if frame is not None and now - at > _RATE_S:
             self._last = (now, frame)
             self._rate = 0.0 if before is None else _rate(before, frame)
         # Frames that are skipped while nothing runs do not count as lost.
         if engine.loop_control is not None:
             self._lost = int(engine.loop_statistics.get("lost", 0.0))
-        elif engine.active_run is not None and self._bench.wfs.is_open:
+        elif engine.active_run is not None and self._bench.wfs.is_open and frames > self._counted_frames:
+            # A procedure that does not read the sensor, such as the model PSF, loses no frames.
             self._lost = self._bench.wfs.status().lost
-        return FrameCounters(frame_hz=self._rate, frames=self._publisher.frames, lost_frames=self._lost)
+        self._counted_frames = frames
+        return FrameCounters(frame_hz=self._rate, frames=frames, lost_frames=self._lost)
 
     def _mirror(self) -> MirrorState:
         dm, command = self._bench.dm, self._publisher.latest_command

@@ -12,7 +12,15 @@ from pydantic import ValidationError
 from escape_hw.config.system import ServerSection
 from escape_hw.errors import EscapeError
 from escape_hw.io.provenance import format_utc
-from escape_hw.remote.state import FaultState, Phase, State
+from escape_hw.remote.state import (
+    DeviceHealth,
+    FaultState,
+    FrameCounters,
+    Illumination,
+    LatencyState,
+    Phase,
+    State,
+)
 from escape_hw.server.frontend.engine_process import STOP_TIMEOUT_S, EngineProcess
 from escape_hw.server.frontend.lease import LeaseManager
 from escape_hw.server.frontend.transport import ZmqTransport
@@ -36,7 +44,8 @@ class PublishedState:
             update={
                 "serial": before.serial + 1, "server_pid": before.server_pid, "lease": self._leases.lease,
                 "clients": self._leases.count, "refused_requests": self._transport.refused,
-                "notes": before.notes,
+                "notes": before.notes, "unattended_for_s": self._leases.seconds_without_holder(),
+                "unattended_limit_s": before.unattended_limit_s,
             }
         )  # fmt: skip
         self._transport.publish("state", self.state)
@@ -221,10 +230,14 @@ class EngineSupervisor:
         """Publish that there is no engine, and why."""
         log.error("FAULT: %s", reason)
         state = self._published.state
+        lost = {"health": DeviceHealth.LOST, "facts": {}, "message": "the engine has ended"}
+        devices = tuple(one.model_copy(update=lost) for one in state.devices)
         self._published.update(
             state.model_copy(
                 update={
-                    "phase": Phase.FAULT, "active_run": None, "streams": (), "engine_pid": 0,
+                    "devices": devices, "rates": FrameCounters(), "illumination": Illumination(),
+                    "latency": LatencyState(), "phase": Phase.FAULT, "active_run": None, "streams": (),
+                    "engine_pid": 0,
                     "fault": FaultState(reason=reason, at_utc=format_utc(), remedy=_RESTART_REMEDY),
                     "loop": state.loop.model_copy(update={"closed": False}),
                 }

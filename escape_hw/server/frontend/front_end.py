@@ -65,7 +65,7 @@ class FrontEnd:
         state = State(
             serial=first_number, at_utc=format_utc(), server_pid=server_pid, version=get_software_version(),
             system=config.system.name, simulated=config.simulated, seed=config.system.seed,
-            notes=self._journal.read_previous_end(),
+            notes=self._journal.read_previous_end(), unattended_limit_s=config.server.unattended_s,
         )  # fmt: skip
         self._published = PublishedState(state, self._leases, transport)
         #: Requests that the engine has not answered yet, and when they were forwarded (monotonic seconds).
@@ -127,10 +127,16 @@ class FrontEnd:
         return time.monotonic() - min(waiting) if waiting else 0.0
 
     def _check_abandoned_run(self) -> None:
-        """Abort a procedure that no client has controlled for a while."""
+        """Abort a procedure that no client has controlled for a while, if there is a limit."""
         state, limit = self._published.state, self._config.server.unattended_s
         abandoned_s, run = self._leases.seconds_without_holder(), state.active_run
-        if run is None or abandoned_s <= limit or state.fault is not None or self._leases.lease is not None:
+        if (
+            not limit
+            or run is None
+            or abandoned_s <= limit
+            or state.fault is not None
+            or self._leases.lease is not None
+        ):
             return
         self._leases.released_s = None
         self._supervisor.make_safe(

@@ -56,7 +56,13 @@ class LeaseManager:
     @property
     def lease(self) -> Lease | None:
         """The lease, for the state document."""
-        return None if self._holder is None else self._holder.lease(self._since)
+        if self._holder is None:
+            return None
+        silent_s = self._clock() - self._holder.last_message_s
+        expires_in_s = max(0.0, self.expiry_s - silent_s)
+        return self._holder.lease(self._since).model_copy(
+            update={"silent_s": silent_s, "expires_in_s": expires_in_s}
+        )
 
     @property
     def count(self) -> int:

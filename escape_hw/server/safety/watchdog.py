@@ -15,6 +15,9 @@ from escape_hw.remote.state import State
 _RECENT_S, _BASELINE_S, _MIN_HISTORY_S = 1.0, 30.0, 4.0
 #: Least interval of residuals; states that are published in between are ignored.
 _MIN_SPACING_S = 0.1
+#: A loop starts with this number of frames. Compiled code may be built at its first use, on a busy computer
+#: for as long as this, seconds; the loop's own rules apply meanwhile.
+_STARTING_FRAMES, _STARTING_LIMIT_S = 200, 60.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,6 +51,8 @@ class Watchdog:
     def __init__(self, limits: ServerSection, clock: Callable[[], float] = time.monotonic) -> None:
         self._limits, self._clock = limits, clock
         self._frames = -1
+        #: Number of frames when the present loop began.
+        self._first_frames = 0
         self._no_frames, self._clipped, self._diverging = _Duration(), _Duration(), _Duration()
         #: Times and residuals in nm.
         self._residuals: deque[tuple[float, float]] = deque()
@@ -63,12 +68,15 @@ class Watchdog:
         loop = state.loop.closed, run, state.mirror.flatten_count
         if loop != self._loop:
             self._loop = loop
+            self._first_frames = state.rates.frames
             self._residuals.clear()
             self._no_frames, self._clipped, self._diverging = _Duration(), _Duration(), _Duration()
         return self._check_frames(state) or self._check_saturation(state) or self._check_divergence(state)
 
     def _check_frames(self, state: State) -> LimitViolation | None:
         now, limit = self._clock(), self._limits.no_frames_s
+        if state.rates.frames - self._first_frames < _STARTING_FRAMES:
+            limit = max(limit, _STARTING_LIMIT_S)
         silent = self._no_frames.update(state.loop.closed and state.rates.frames == self._frames, now)
         self._frames = state.rates.frames
         if silent <= limit:

@@ -1,0 +1,63 @@
+"""Input fields that only the operator's own keys, clicks and wheel change."""
+
+from __future__ import annotations
+
+from PySide6.QtCore import QEvent, QObject, Qt, Signal
+from PySide6.QtWidgets import QAbstractSpinBox, QDoubleSpinBox, QWidget
+
+#: Range in which a number can be typed, so that a value out of its limits can be reported.
+_TYPED_RANGE = 1e6
+
+
+class _WheelFilter(QObject):
+    def eventFilter(self, watched: QObject, event: QEvent) -> bool:
+        if event.type() is QEvent.Type.Wheel and isinstance(watched, QWidget) and not watched.hasFocus():
+            event.ignore()
+            return True
+        return False
+
+
+def ignore_wheel_without_focus(widget: QWidget) -> None:
+    """Pass the wheel on to the scroll area around a field that does not have the focus."""
+    widget.setFocusPolicy(Qt.FocusPolicy.StrongFocus)
+    widget.installEventFilter(_WheelFilter(widget))
+
+
+class NumberBox(QDoubleSpinBox):
+    """A number with limits. Other numbers can be typed, to be reported; arrows and wheel stay within them."""
+
+    #: The operator changed the value: emitted from the first key on, but not by :meth:`setValue`.
+    edited = Signal()
+
+    def __init__(self, low: float, high: float, *, step: float, decimals: int) -> None:
+        super().__init__()
+        self.low, self.high = low, high
+        self.setRange(-_TYPED_RANGE, _TYPED_RANGE)
+        self.setSingleStep(step)
+        self.setDecimals(decimals)
+        self._typed = False
+        self.lineEdit().textEdited.connect(self._on_typed)
+        # Emitted after the previous signal, when Qt has updated the value.
+        self.lineEdit().textChanged.connect(self._on_text)
+        ignore_wheel_without_focus(self)
+
+    def _on_typed(self) -> None:
+        self._typed = True
+
+    def _on_text(self) -> None:
+        if self._typed:
+            self._typed = False
+            self.edited.emit()
+
+    def stepBy(self, steps: int) -> None:
+        self.interpretText()
+        self.setValue(min(max(self.value() + steps * self.singleStep(), self.low), self.high))
+        self.edited.emit()
+
+    def stepEnabled(self) -> QAbstractSpinBox.StepEnabledFlag:
+        flags = QAbstractSpinBox.StepEnabledFlag.StepNone
+        if self.value() > self.low:
+            flags |= QAbstractSpinBox.StepEnabledFlag.StepDownEnabled
+        if self.value() < self.high:
+            flags |= QAbstractSpinBox.StepEnabledFlag.StepUpEnabled
+        return flags

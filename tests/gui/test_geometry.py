@@ -1,0 +1,70 @@
+"""The safety buttons and the last line are visible at any width from 1024 pixels."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+from gui_windows import dispose, show_window
+from PySide6.QtCore import QPoint, QRect
+from PySide6.QtWidgets import QApplication, QWidget
+
+from escape_gui.client.session import Session
+from escape_gui.main_window import MainWindow
+from escape_gui.settings import Settings
+from escape_gui.window.docks import WORKSPACES
+
+Show = Callable[[Settings], MainWindow]
+
+
+@pytest.fixture
+def show(session: Session, tmp_path):
+    shown: list[MainWindow] = []
+
+    def show_with(settings: Settings) -> MainWindow:
+        shown.append(show_window(session, tmp_path / "gui.json", settings=settings))
+        return shown[-1]
+
+    yield show_with
+    for window in shown:
+        dispose(window)
+
+
+def assert_is_inside(widget: QWidget, window: MainWindow) -> None:
+    assert widget.isVisible()
+    place = QRect(widget.mapTo(window, QPoint(0, 0)), widget.size())
+    assert window.rect().contains(place), f"{place} is not inside {window.rect()}"
+
+
+def check(window: MainWindow, width: int, height: int) -> None:
+    for one in WORKSPACES:
+        window.show_workspace(one.name)
+        window.update_timer.tick(force=True)
+        for _ in range(3):
+            QApplication.processEvents()
+        assert (window.width(), window.height()) == (width, height), one.name
+        for button in (window.header.open_button, window.header.flatten_button, window.statusBar()):
+            assert_is_inside(button, window)
+
+
+@pytest.mark.parametrize("scale", [1.0, 1.2])
+@pytest.mark.parametrize("size", [(1024, 700), (1280, 760), (2560, 1400)])
+def test_safety_buttons_and_messages_are_visible(size: tuple[int, int], scale: float, show: Show) -> None:
+    window = show(Settings(font_scale=scale))
+    window.resize(*size)
+    check(window, *size)
+
+
+def test_the_layout_of_a_wide_screen_fits_a_narrow_one(show: Show) -> None:
+    wide = show(Settings())
+    wide.resize(2560, 1400)
+    for one in WORKSPACES:
+        wide.show_workspace(one.name)
+        QApplication.processEvents()
+    wide.close_without_question()
+    window = show(wide._settings)
+    window.resize(2560, 1400)
+    window.fit_to_screen(QRect(0, 0, 1024, 768))
+    QApplication.processEvents()
+    assert QRect(0, 0, 1024, 768).contains(window.geometry())
+    check(window, 1016, 736)

@@ -1,0 +1,40 @@
+"""The line of verdict on a result."""
+
+from __future__ import annotations
+
+import pytest
+
+from escape_hw.report.verdict import Quality, assess
+
+ESCAPE = {"converged": True, "iterations": 15, "frames": 600, "snr": {"min": 23.8}, "criteria": []}
+
+
+@pytest.mark.parametrize(
+    ("changes", "quality", "words"),
+    [
+        ({}, Quality.GOOD, "Good: SNR 23.8 in the worst mode, converged in 15 iterations"),
+        (
+            {"snr": {"min": 0.35}},
+            Quality.USABLE,
+            "Usable: SNR 0.35 in the worst mode; measure about 44,000 frames",
+        ),
+        ({"converged": False}, Quality.NOT_USABLE, "Not usable: not converged"),
+        ({"converged": None, "snr": {"min": 0.35}}, Quality.NOT_USABLE, "SNR 0.35 in the worst mode"),
+        ({"converged": None, "snr": {"min": 2.0}}, Quality.USABLE, "measure about 1,400 frames"),
+        ({"criteria": [{"text": "loop stable", "met": False}]}, Quality.NOT_USABLE, "not met: loop stable"),
+        ({"warnings": ["scaling beyond 5 %"]}, Quality.USABLE, "scaling beyond 5 %; see the report"),
+        ({"partial": True}, Quality.USABLE, "aborted"),
+        ({"alarms": [{}, {}]}, Quality.USABLE, "2 alarms"),
+    ],
+)
+def test_verdict_has_quality_reason_and_advice(
+    changes: dict[str, object], quality: Quality, words: str
+) -> None:
+    verdict = assess({**ESCAPE, **changes})
+    assert verdict is not None
+    assert verdict.quality is quality
+    assert words in str(verdict)
+
+
+def test_a_result_without_a_criterion_has_no_verdict() -> None:
+    assert assess({"frames": 100, "criteria": []}) is None
