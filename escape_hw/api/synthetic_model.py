@@ -76,6 +76,22 @@ class HasActuatorPositions(Protocol):
         ...
 
 
+#: Widths, relative to nominal, of the functions whose sum is a radial profile.
+PROFILE_WIDTHS = (1.0, 0.35, 0.6, 1.7, 2.9)
+
+
+@runtime_checkable
+class HasProfile(Protocol):
+    """A model whose nominal influence function is a sum of one function at several widths."""
+
+    @property
+    def profile_shares(self) -> tuple[float, ...]:
+        """Share of the function at each of :data:`PROFILE_WIDTHS`."""
+
+    def component_model(self) -> SyntheticModel:
+        """The same model with the function alone as the nominal influence function."""
+
+
 @runtime_checkable
 class HasSystematicError(Protocol):
     """A model with a systematic error of the origin of its registration."""

@@ -203,8 +203,14 @@ class MirrorConfig(DeviceConfig):
     pitches_across_pupil: float = Field(
         gt=0, le=200, description="actuator pitches across the diameter of the pupil"
     )
+    influence: Literal["gaussian", "exponential"] = Field(
+        "gaussian", description="profile of the nominal influence functions: gaussian or exponential"
+    )
     coupling: float = Field(
         ge=0.01, le=0.9, description="nominal influence at the adjacent actuator, fraction of the peak"
+    )
+    rounding: float = Field(
+        0.27, gt=0, le=1, description="radius of the rounded tip of an exponential profile, pitches"
     )
     stroke_m: float = Field(gt=0, le=1e-3, description="metres of surface at the actuator for a command of 1")
     limits: LimitsConfig = Field(default_factory=LimitsConfig, description="limits of every command")

@@ -11,6 +11,8 @@ from escape_hw.errors import ConfigError
 from escape_sim.mirror.influence_functions import (
     InfluenceFunctions,
     MeasuredInfluenceFunctions,
+    exponential_length,
+    exponential_profile,
     layout_positions,
     read_influence_functions,
 )
@@ -39,7 +41,7 @@ def dense(m, registration):
     out = np.zeros((m.n_act, Y.size, X.size))
     for a, position in enumerate(m.positions_m):
         x, y = matrix @ position + offset
-        for share, scale in ((1 - m.wing, 1.0), (m.wing, m.wing_scale)):
+        for share, scale in m.profile:
             # Along the radial direction, which lies at minus the anamorphosis angle, and across it.
             c, s = (f(np.deg2rad(registration.anamorphosis_angle)) for f in (np.cos, np.sin))
             dx, dy = X[None, :] - x, Y[:, None] - y
@@ -53,13 +55,12 @@ def rough(n):
     return {
         "width": 1 + 0.1 * rng.standard_normal(n),
         "gain": 1 + 0.1 * rng.standard_normal(n),
-        "wing": 0.15,
-        "wing_scale": 2.5,
+        "profile": ((0.85, 1.0), (0.15, 2.5)),
     }
 
 
 @pytest.mark.parametrize("registration", [Registration(), GENERAL, ANAMORPHIC])
-@pytest.mark.parametrize("options", [{}, rough(33)], ids=["plain", "with scatter and wings"])
+@pytest.mark.parametrize("options", [{}, rough(33)], ids=["plain", "with scatter and two Gaussians"])
 def test_separable_factors_make_the_dense_formula(registration, options):
     m = mirror(**options)
     want = dense(m, registration)
@@ -224,3 +225,17 @@ def test_influence_functions_from_a_file(tmp_path):
     fits.writeto(tmp_path / "nan.fits", cube)
     with pytest.raises(ConfigError, match="not finite"):
         read_influence_functions(str(tmp_path / "nan.fits"), 5)
+
+
+@pytest.mark.parametrize("rounding", [0.18, 0.27, 0.35])
+@pytest.mark.parametrize("coupling", [0.3, 0.42, 0.5])
+def test_a_sum_of_gaussians_approximates_a_rounded_exponential(coupling, rounding):
+    r = np.linspace(0, 4, 801)
+    length = exponential_length(coupling, rounding)
+    exact = np.exp(-(np.hypot(r, rounding) - rounding) / length)
+    assert exact[200] == pytest.approx(coupling)
+    sigma = 1 / np.sqrt(2 * np.log(1 / coupling))
+    profile = exponential_profile(coupling, rounding)
+    found = sum(share * np.exp(-0.5 * (r / (sigma * width)) ** 2) for share, width in profile)
+    slope, error = np.gradient(exact, r), np.gradient(found - exact, r)
+    assert np.sqrt(np.sum(r * error**2) / np.sum(r * slope**2)) < 0.06

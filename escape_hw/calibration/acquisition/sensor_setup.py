@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from escape_hw.api.modulator import Modulation
 from escape_hw.api.procedure import Procedure, Reporter
@@ -23,6 +24,8 @@ from escape_hw.pipeline.geometry.pupil_images import find_pupil_images, refine_p
 from escape_hw.pipeline.slopes.pyramid import PyramidSlopes
 from escape_hw.pipeline.slopes.shack_hartmann import ShackHartmannSlopes
 
+#: Pixels over which a frame is smoothed to find its dark parts.
+_SMOOTHING_PX = 9
 #: Frames whose mean the geometry is found on.
 SETUP_FRAMES = 200
 #: Relative difference allowed between the modulation of a geometry and the one in force.
@@ -153,11 +156,13 @@ def get_sensor_kind(bench: Bench) -> _Pyramid | _ShackHartmann:
 
 
 def _estimate_dark_level(mean_frame: NDArray[np.float32]) -> float:
-    """Level of the pixels without light, in counts: median of the darkest fifth.
+    """Level of the pixels without light, in counts: median of the darkest fifth of a smoothed frame.
 
-    These are the pixels between the spots and outside the pupil, without the wings of bright spots.
+    These are the pixels outside the pupil, without the wings of bright spots. Smoothing makes the choice of
+    the darkest independent of the fixed pattern, which would otherwise lower the level.
     """
-    darkest = np.sort(mean_frame.ravel())[: max(1, mean_frame.size // 5)]
+    smooth = ndimage.uniform_filter(mean_frame.astype(np.float32), _SMOOTHING_PX)
+    darkest = mean_frame.ravel()[np.argsort(smooth.ravel())[: max(1, mean_frame.size // 5)]]
     return float(np.median(darkest))
 
 

@@ -68,8 +68,8 @@ class LowRankNoise:
         return np.asarray(np.eye(len(self.patterns)) / self.level + correction @ self.patterns.T)
 
 
-#: Groups of actuators that are left out in turn.
-_N_GROUPS = 20
+#: Groups of actuators, and rings of sub-apertures, that are left out in turn.
+_N_GROUPS, _N_RINGS = 20, 4
 
 
 def systematic_error(model: SyntheticModel) -> NDArray[np.float64]:
@@ -159,12 +159,39 @@ def _resampled_covariance(
     by_actuator = np.einsum("psa,sa->pa", zonal, residual @ modes.T)
     groups = np.array_split(np.arange(len(modes)), min(_N_GROUPS, len(modes)))
     information = np.einsum("psa,qsa->pqa", zonal, commanded, optimize=True)
-    steps = []
+    steps: list[NDArray[np.float64]] = []
     for group in groups:
         part = information[:, :, group].sum(axis=2)
         steps.append(np.linalg.solve(total - (part + part.T) / 2, by_actuator[:, group].sum(axis=1)))
+    return _jackknife_covariance(steps)
+
+
+def _resampled_by_slopes(
+    total: NDArray[np.float64],
+    scores: NDArray[np.float64],
+    residual: NDArray[np.float64],
+    valid: NDArray[np.bool_],
+) -> NDArray[np.float64]:
+    """The same from leaving out the x or y slopes of a ring of sub-apertures in turn ``(n, n)``.
+
+    Errors of a model of the sensor depend on the direction of the slopes and the distance from the rim.
+    """
+    rows, columns = np.nonzero(valid)
+    centre = (np.array(valid.shape) - 1) / 2
+    by_radius = np.argsort(np.hypot(rows - centre[0], columns - centre[1]), kind="stable")
+    steps: list[NDArray[np.float64]] = []
+    for ring in np.array_split(by_radius, _N_RINGS):
+        for group in (ring, ring + len(rows)):
+            part = scores[:, group].reshape(len(scores), -1)
+            step = np.linalg.solve(total - part @ part.T, -part @ residual[group].ravel())
+            steps.append(np.asarray(step))
+    return _jackknife_covariance(steps)
+
+
+def _jackknife_covariance(steps: list[NDArray[np.float64]]) -> NDArray[np.float64]:
+    """Covariance ``(n, n)`` from the steps that leaving out each group causes."""
     deviations = np.array(steps) - np.mean(steps, axis=0)
-    return np.asarray(deviations.T @ deviations * (len(groups) - 1) / len(groups))
+    return np.asarray(deviations.T @ deviations * (len(steps) - 1) / len(steps))
 
 
 def sandwich_covariance(
@@ -179,8 +206,9 @@ def sandwich_covariance(
     only their excess over the noise is added, because the scores at a solution sum to zero and the window
     alone would underestimate the noise. Without a covariance of the noise the window is used for both, plus
     the scatter of the scores from mode to mode, which contains errors common to all slopes during the
-    measurement of a mode. What differences between the actuators can do to the parameters beyond that is
-    estimated by leaving out groups of them (:func:`_resampled_covariance`).
+    measurement of a mode. What differences between the actuators and errors of the model of the sensor can
+    do to the parameters beyond that is estimated by leaving out groups of actuators and of slopes
+    (:func:`_resampled_covariance`, :func:`_resampled_by_slopes`).
 
     Parameters
     ----------
@@ -211,5 +239,7 @@ def sandwich_covariance(
     # Not smaller than the errors due to noise alone.
     scale = np.sqrt(np.maximum(power * np.diag(bread) / np.diag(estimate), 1.0))
     covariance = estimate * np.outer(scale, scale)
+    by_slopes = _resampled_by_slopes(system.information(), scores, system.residual, valid)
+    covariance = covariance + _positive_part(by_slopes - estimate)
     resampled = _resampled_covariance(system.information(), scores, system.residual, weighted.modes)
     return np.asarray(covariance + _positive_part(resampled - covariance))

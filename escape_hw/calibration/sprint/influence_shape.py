@@ -15,11 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from escape_hw.api.registration import Registration
-from escape_hw.api.synthetic_model import HasActuatorPositions, SyntheticModel
+from escape_hw.api.synthetic_model import PROFILE_WIDTHS, HasActuatorPositions, HasProfile, SyntheticModel
 from escape_hw.calibration.modes.derivatives import zonal_jacobian
 
-#: Widths of the components of the radial profile, relative to the nominal one.
-PROFILE_WIDTHS = (0.35, 0.6, 1.7, 2.9)
 #: Lobes of the four-fold terms: distance in pitches, and width relative to the nominal one.
 _FOURFOLD_LOBES = ((0.4, 0.35), (0.8, 0.6), (1.6, 1.0))
 _N_LOBES = 8
@@ -72,8 +70,11 @@ class InfluenceShape:
     """
 
     def __init__(self, model: SyntheticModel) -> None:
+        self._shares = np.eye(len(PROFILE_WIDTHS))[0]
         self._model = model
-        self._widths = PROFILE_WIDTHS
+        if isinstance(model, HasProfile):
+            self._shares, self._model = np.array(model.profile_shares), model.component_model()
+        self._widths = PROFILE_WIDTHS[1:]
         n = len(self._widths)
         self.names = [f"profile_{width:g}" for width in self._widths]
         sigma = [_PROFILE_SIGMA] * n
@@ -113,14 +114,20 @@ class InfluenceShape:
         coefficients
             Coefficient of each term ``(n_terms,)``.
         """
-        nominal, base = zonal_jacobian(self._model, registration, width)
-        jacobian, profile, outward = base.copy(), [], [self._outward_derivative(base)]
-        for relative_width, share in zip(self._widths, coefficients, strict=False):
+        single, by_single = zonal_jacobian(self._model, registration, width)
+        nominal, base = self._shares[0] * single, self._shares[0] * by_single
+        jacobian, profile, outward = 0.0, [], [self._outward_derivative(by_single)]
+        for relative_width, nominal_share, share in zip(
+            self._widths, self._shares[1:], coefficients, strict=False
+        ):
             component, derivatives = zonal_jacobian(self._model, registration, width * relative_width)
             derivatives[5] *= relative_width
-            jacobian += share * (derivatives - base)
-            profile.append(component - nominal)
+            nominal += nominal_share * component
+            base += nominal_share * derivatives
+            jacobian = jacobian + share * (derivatives - by_single)
+            profile.append(component - single)
             outward.append(relative_width**2 * self._outward_derivative(derivatives))
+        jacobian = base + jacobian
         terms = profile
         if self._edge is not None:
             terms = terms + self._fourfold_terms(registration, width)

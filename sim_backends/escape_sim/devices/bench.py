@@ -15,6 +15,7 @@ from escape_sim.atmosphere.layers import Atmosphere, Seeing
 from escape_sim.atmosphere.phase_plates import PhasePlates
 from escape_sim.mirror.dynamics import MirrorDynamics
 from escape_sim.mirror.influence_functions import (
+    SINGLE_GAUSSIAN,
     InfluenceFunctions,
     MeasuredInfluenceFunctions,
     actuator_positions,
@@ -37,6 +38,8 @@ if TYPE_CHECKING:
 
 #: Spawn key that separates the streams of a run from those of a bench with the same seed.
 _RUN_KEY = 0x52554E
+#: Width of the wings of influence functions relative to their core.
+_WING_WIDTH = 2.0
 #: Largest lag in seconds behind the wall clock that a paced bench catches up.
 _MAX_LAG_S = 0.05
 
@@ -294,9 +297,14 @@ class SimBench:
                 length_scatter=mirror.width_scatter, coupling=mirror.coupling,
             )  # fmt: skip
         if shape == "gaussian":
+            wing = mirror.wing_fraction
+            profile: tuple[tuple[float, float], ...] = SINGLE_GAUSSIAN
+            if wing:
+                profile = ((1 - wing, 1.0), (wing, _WING_WIDTH))
             return InfluenceFunctions(
                 positions, pitch, coupling, width=1 + mirror.width_scatter * truth.standard_normal(n),
-                gain=1 + mirror.gain_scatter * truth.standard_normal(n), wing=mirror.wing_fraction,
+                gain=1 + mirror.gain_scatter * truth.standard_normal(n),
+                profile=profile,
             )  # fmt: skip
         gain = 1 + mirror.gain_scatter * truth.standard_normal(n)
         if shape == "thin-plate":

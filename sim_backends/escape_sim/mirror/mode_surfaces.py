@@ -18,18 +18,34 @@ N_DERIVATIVES = 6
 class GaussianFactors:
     """Separable factors of all influence functions on a grid, and of their derivatives.
 
-    With ``X_0 = exp(-u^2 / 2)``, ``u = (x - x_a) / s_x``, the derivative of a factor by the actuator's
-    position is ``X_1 = X_0 u / s_x`` and by the logarithm of its width ``X_2 = X_0 u^2``.
+    The last axis has all actuators for each Gaussian of the profile in turn ``(n_terms * n_act,)``. With
+    ``X_0 = exp(-u^2 / 2)``, ``u = (x - x_a) / s_x``, the derivative of a factor by the actuator's position is
+    ``X_1 = X_0 u / s_x`` and by the logarithm of its width ``X_2 = X_0 u^2``.
 
     """
 
-    #: ``X_0, X_1, X_2`` ``(3, n_x, n_act)``, and the same along y ``(3, n_y, n_act)``.
+    #: ``X_0, X_1, X_2`` ``(3, n_x, n_terms * n_act)``, and the same along y ``(3, n_y, n_terms * n_act)``.
     along_x: NDArray[np.floating]
     along_y: NDArray[np.floating]
     #: Derivatives of the actuator positions ``(6, 2, n_act)`` as (x, y), metres per unit of the parameter.
     position: NDArray[np.floating]
     #: Derivatives of the logarithm of the widths along x and y ``(6, 2)``.
     log_width: NDArray[np.floating]
+
+    @property
+    def n_terms(self) -> int:
+        """Number of Gaussians of the profile."""
+        return int(self.along_x.shape[2] // self.position.shape[2])
+
+    def sum_terms(self, values: NDArray[np.floating]) -> NDArray[np.floating]:
+        """Sums over the Gaussians ``(..., n_act)`` of values ``(..., n_terms * n_act)``."""
+        if self.n_terms == 1:
+            return values
+        return np.asarray(values.reshape(*values.shape[:-1], self.n_terms, -1).sum(axis=-2))
+
+    def commands(self, m2c: NDArray[np.floating]) -> NDArray[np.floating]:
+        """Commands of all Gaussians ``(n_terms * n_act, n_modes)`` for ``m2c (n_act, n_modes)``."""
+        return np.tile(m2c, (self.n_terms, 1)).astype(self.along_x.dtype)
 
 
 def gaussian_factors(
@@ -40,25 +56,29 @@ def gaussian_factors(
     y_m: NDArray[np.float64],
     dtype: DTypeLike = np.float32,
 ) -> GaussianFactors:
-    """Factors of influence functions without a wing, and of their derivatives.
+    """Factors of influence functions of equal width and gain, and of their derivatives.
 
-    The grid is given as for :meth:`InfluenceFunctions.factors`. The gain is contained in the factors along
-    y. Single precision gives 1e-6 of a surface.
+    The grid is given as for :meth:`InfluenceFunctions.factors`. Gain and shares are contained in the factors
+    along y. Single precision gives 1e-6 of a surface.
 
     Raises
     ------
     ValueError
-        The influence functions have a wing, or one width or gain per actuator; or the registration
-        has an anamorphosis angle.
+        The influence functions have one width or gain per actuator, or the registration has an anamorphosis
+        angle.
     """
-    if influence.wing or np.ndim(influence.width) or np.ndim(influence.gain):
-        raise ValueError("derivatives need influence functions of equal width and gain, without a wing")
+    if np.ndim(influence.width) or np.ndim(influence.gain):
+        raise ValueError("derivatives need influence functions of equal width and gain")
     if registration.anamorphosis_angle:
         raise ValueError(
             f"the anamorphosis angle is {registration.anamorphosis_angle}; derivatives need an angle of 0"
         )
     at = influence.registered_positions(registration, sub_aperture_m)
-    sigma = float(influence.width) * influence.pitch_m / np.sqrt(2 * np.log(1 / influence.coupling))
+    shares, scales = np.repeat(np.transpose(influence.profile), influence.n_act, axis=1)
+    at = np.tile(at, (len(influence.profile), 1))
+    sigma = scales * (
+        float(influence.width) * influence.pitch_m / np.sqrt(2 * np.log(1 / influence.coupling))
+    )
     stretch = 1 + np.array([registration.radial_scaling, registration.tangential_scaling]) / 100
     factors_xy = []
     for coordinates, position, s in (
@@ -68,7 +88,7 @@ def gaussian_factors(
         u = (coordinates[:, None] - position) / s
         gauss = np.exp(-0.5 * np.square(u))
         factors_xy.append(np.stack([gauss, gauss * u / s, gauss * np.square(u)]))
-    factors_xy[1] *= float(influence.gain)
+    factors_xy[1] *= float(influence.gain) * shares
     position, log_width = _parameter_derivatives(influence, registration, sub_aperture_m, stretch)
     return GaussianFactors(
         factors_xy[0].astype(dtype), factors_xy[1].astype(dtype), position.astype(dtype), log_width
@@ -99,17 +119,18 @@ def _parameter_derivatives(
 
 def mode_surfaces(factors: GaussianFactors, m2c: NDArray[np.floating]) -> NDArray[np.floating]:
     """Surfaces of modes ``(n_y, n_x, n_modes)`` in fractions of full stroke, for ``m2c (n_act, n_modes)``."""
-    return _product(factors.along_y[0], factors.along_x[0], m2c.astype(factors.along_x.dtype))
+    return _product(factors.along_y[0], factors.along_x[0], factors.commands(m2c))
 
 
 def mode_derivatives(factors: GaussianFactors, m2c: NDArray[np.floating]) -> NDArray[np.floating]:
     """Surfaces of modes and their derivatives ``(n_y, n_x, 1 + 6, n_modes)``, the surfaces first."""
     x, y = factors.along_x, factors.along_y
-    c = m2c.astype(x.dtype)
+    c = factors.commands(m2c)
+    position = np.tile(factors.position, factors.n_terms)
     out = np.empty((y.shape[1], x.shape[1], 1 + N_DERIVATIVES, c.shape[1]), x.dtype)
     out[:, :, 0] = _product(y[0], x[0], c)
     for p in range(N_DERIVATIVES):
-        (shift_x, shift_y), (width_x, width_y) = factors.position[p], factors.log_width[p].astype(x.dtype)
+        (shift_x, shift_y), (width_x, width_y) = position[p], factors.log_width[p].astype(x.dtype)
         total = out[:, :, 1 + p]
         total[...] = 0
         if shift_x.any() or width_x:
@@ -129,9 +150,9 @@ def _product(
 
 
 #: Nodes per standard deviation of an influence function across half the pupil. The Chebyshev
-#: coefficients of a Gaussian fall as ``exp(-(k sigma)^2 / 2)``: with 6 the error is 2e-7 at nominal
-#: width and 1e-5 at 0.8 of it.
-_NODES_PER_SIGMA = 6.0
+#: coefficients of a Gaussian fall as ``exp(-(k sigma)^2 / 2)``: with 7 the error of a pyramid's slopes is
+#: below 1e-6 at nominal width, 4e-5 at 0.6 and 2 % at 0.35 of it, which is a tenth of a profile at most.
+_NODES_PER_SIGMA = 7.0
 
 
 def surface_nodes(

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from escape_hw.api.registration import Registration
+from escape_sim.mirror.influence_functions import exponential_length
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -113,7 +114,7 @@ def draw_exponential(
     n, edge = len(positions_m), radius > radius.max() - _EDGE_RING * pitch_m
     length, rounding = rng.uniform(*_LENGTH), rng.uniform(*_ROUNDING)
     if coupling is not None:
-        length = (np.hypot(1, rounding) - rounding) / -np.log(coupling)
+        length = exponential_length(coupling, rounding)
     fourfold = rng.uniform(*_FOURFOLD)
     gain = 1 + gain_scatter * rng.standard_normal(n)
     lengths = length * (1 + length_scatter * rng.standard_normal(n))

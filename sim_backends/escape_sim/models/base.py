@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from escape_hw.api.registration import Registration
-from escape_sim.mirror.influence_functions import nominal_influence_functions
+from escape_hw.api.synthetic_model import PROFILE_WIDTHS
+from escape_sim.mirror.influence_functions import SINGLE_GAUSSIAN, nominal_influence_functions
 from escape_sim.mirror.mode_surfaces import GaussianFactors, gaussian_factors
 from escape_sim.optics.pupil import PupilGeometry
 
@@ -33,6 +35,18 @@ class DesignModel:
     def actuator_positions_m(self) -> NDArray[np.float64]:
         """Nominal positions of the actuators ``(n_act, 2)`` as (x, y) on the pupil in metres."""
         return self._nominal.positions_m
+
+    @property
+    def profile_shares(self) -> tuple[float, ...]:
+        """Share of each width of the profile, see :class:`HasProfile`."""
+        shares = {width: share for share, width in self._nominal.profile}
+        return tuple(shares.get(width, 0.0) for width in PROFILE_WIDTHS)
+
+    def component_model(self) -> Self:
+        """The same model with a single Gaussian, see :class:`HasProfile`."""
+        single = copy.copy(self)
+        single._nominal = replace(self._nominal, profile=SINGLE_GAUSSIAN)  # noqa: SLF001
+        return single
 
     @property
     def sub_aperture_m(self) -> float:

@@ -14,7 +14,13 @@ from escape_hw.api.registration import Registration
 from escape_hw.calibration.modes.bases import build_basis
 from escape_hw.config.sensor import PyramidSection
 from escape_sim.atmosphere.von_karman import structure_function
-from escape_sim.mirror.mode_surfaces import N_DERIVATIVES, mode_derivatives, mode_surfaces, surface_nodes
+from escape_sim.mirror.mode_surfaces import (
+    N_DERIVATIVES,
+    GaussianFactors,
+    mode_derivatives,
+    mode_surfaces,
+    surface_nodes,
+)
 from escape_sim.models.base import DesignModel
 from escape_sim.models.pyramid_response import slope_response
 from escape_sim.models.pyramid_turbulence import (
@@ -66,6 +72,14 @@ def nominal_pupils(config: SystemConfig) -> PyramidPupils:
         np.zeros((int(valid.sum()), 2), np.float32), flux.astype(np.float32),
         normalisation=sensor.normalisation, modulation=sensor.modulation,
     )  # fmt: skip
+
+
+def _zonal_surfaces(factors: GaussianFactors, kind_x: int, kind_y: int) -> NDArray[np.floating]:
+    """Products ``(n_y, n_x, n_act)`` of two factors, summed over the Gaussians of the profile."""
+    x, y = (
+        f.reshape(len(f), factors.n_terms, -1) for f in (factors.along_x[kind_x], factors.along_y[kind_y])
+    )
+    return np.asarray(np.einsum("yka,xka->yxa", y, x))
 
 
 class PyramidModel(DesignModel):
@@ -158,7 +172,7 @@ class PyramidModel(DesignModel):
             # An inclined elliptic Gaussian is not separable in x and y.
             return self._slopes(np.moveaxis(self._surfaces(self._nodes, registration, width), 0, 2))
         factors = self._factors(self._nodes, registration, width)
-        return self._slopes(np.einsum("ya,xa->yxa", factors.along_y[0], factors.along_x[0]))
+        return self._slopes(_zonal_surfaces(factors, 0, 0))
 
     def modal_matrix(
         self, registration: Registration, m2c: NDArray[np.float64], width: float = 1.0
@@ -180,9 +194,8 @@ class PyramidModel(DesignModel):
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Zonal matrix and its derivatives, see :class:`DifferentiableModel`."""
         factors = self._factors(self._nodes, registration, width)
-        x, y = factors.along_x, factors.along_y
         pairs = ((0, 0), (1, 0), (0, 1), (2, 0), (0, 2))
-        parts = [self._slopes(np.einsum("ya,xa->yxa", y[j], x[i])) for i, j in pairs]
+        parts = [self._slopes(_zonal_surfaces(factors, i, j)) for i, j in pairs]
         # By the positions along x and y, and by the logarithms of the widths along x and y.
         derivatives = np.concatenate(
             [factors.position, np.repeat(factors.log_width[:, :, None], self.n_act, 2)], axis=1

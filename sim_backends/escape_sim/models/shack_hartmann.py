@@ -410,14 +410,15 @@ class ShackHartmannModel(DesignModel):
             surfaces = np.moveaxis(self._surfaces(self._slopes.nodes_m, registration, width), 0, 2).copy()
             return np.asarray(self._slopes.slopes(surfaces) * self._opd_per_command_m)
         factors = self._factors(self._slopes.nodes_m, registration, width, np.float64)
-        return np.asarray(self._slopes.zonal(factors)[0] * self._opd_per_command_m)
+        return np.asarray(factors.sum_terms(self._slopes.zonal(factors)[0]) * self._opd_per_command_m)
 
     def zonal_jacobian(
         self, registration: Registration, width: float = 1.0
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Zonal matrix and its derivatives, see :class:`DifferentiableModel`; single precision."""
         factors = self._factors(self._slopes.nodes_m, registration, width)
-        parts = self._slopes.zonal(factors, derivatives=True) * np.float32(self._opd_per_command_m)
+        parts = factors.sum_terms(self._slopes.zonal(factors, derivatives=True))
+        parts *= np.float32(self._opd_per_command_m)
         out = np.empty((N_DERIVATIVES, *parts.shape[1:]))
         for p, ((along_x, along_y), (width_x, width_y)) in enumerate(
             zip(factors.position, factors.log_width, strict=True)
@@ -438,14 +439,14 @@ class ShackHartmannModel(DesignModel):
             return np.asarray(
                 self._slopes.slopes(mode_surfaces(factors, m2c)) * self._opd_per_command_m, dtype=float
             )
-        return np.asarray(self._slopes.zonal(factors)[0] @ (m2c * self._opd_per_command_m))
+        return np.asarray(factors.sum_terms(self._slopes.zonal(factors)[0]) @ (m2c * self._opd_per_command_m))
 
     def modal_jacobian(
         self, registration: Registration, m2c: NDArray[np.float64], width: float = 1.0
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Modal matrix and its derivatives, see :class:`DifferentiableModel`; single precision."""
         factors = self._factors(self._slopes.nodes_m, registration, width)
-        parts = self._slopes.zonal(factors, derivatives=True)
+        parts = factors.sum_terms(self._slopes.zonal(factors, derivatives=True))
         modes = (m2c * self._opd_per_command_m).astype(np.float32)
         out = np.zeros((N_DERIVATIVES, parts.shape[1], m2c.shape[1]))
         for p in range(N_DERIVATIVES):

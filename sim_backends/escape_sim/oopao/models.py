@@ -40,7 +40,7 @@ POKE_SURFACE_M = 0.5e-9
 #: Actuators propagated together; limits the memory.
 _BATCH = 16
 #: Widths whose mirrors are kept.
-_MAX_CACHED_MIRRORS = 4
+_MAX_CACHED_MIRRORS = 8
 
 
 class OOPAOPushPullModel(DesignModel, abc.ABC):
@@ -59,12 +59,28 @@ class OOPAOPushPullModel(DesignModel, abc.ABC):
 
     def influence_functions(self) -> tuple[NDArray[np.float64], NDArray[np.bool_], float]:
         """Nominal influence functions, see :class:`SyntheticModel`."""
-        modes = np.asarray(self._nominal_mirror(1.0).modes, dtype=float)
+        modes = np.sum(
+            [share * self._nominal_mirror(width).modes for share, width in self._nominal.profile],
+            axis=0,
+            dtype=float,
+        )
         lit = self._pupil.lit
         return modes.T.reshape(self.n_act, *lit.shape), lit, self._pupil.pixel_m
 
     def zonal_matrix(self, registration: Registration, width: float = 1.0) -> NDArray[np.float64]:
-        """Slopes per unit command ``(n_slopes, n_act)``, see :class:`SyntheticModel`."""
+        """Slopes per unit command ``(n_slopes, n_act)``, see :class:`SyntheticModel`.
+
+        Small signals are linear: the slopes are the sums of those of OOPAO's Gaussian mirrors.
+        """
+        return np.asarray(
+            sum(
+                share * self._push_pull(registration, width * relative_width)
+                for share, relative_width in self._nominal.profile
+            )
+        )
+
+    def _push_pull(self, registration: Registration, width: float) -> NDArray[np.float64]:
+        """Slopes per unit command of Gaussian influence functions ``width`` times the nominal width."""
         mirror = self.registered_mirror(registration, width)
         # The optical path changes by twice the surface.
         pokes = np.eye(self.n_act) * 2 * POKE_SURFACE_M
