@@ -255,7 +255,7 @@ def test_a_mirror_on_the_network_is_found_at_a_given_host(document) -> None:
     assert mirror["serial"] == "SIM336"
     assert "emulated" in mirror["model"]
     assert f"port = {where.rpartition(':')[2]}" in mirror["toml"]
-    assert "disabled = [248, 249" in mirror["toml"]
+    assert "disabled = [259, 260" in mirror["toml"]
 
 
 def test_missing_libraries_of_the_window_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -98,14 +98,14 @@ def test_every_call_of_a_session_arrives_in_order() -> None:
 
 
 def test_disabled_actuators_are_reported_and_never_driven() -> None:
-    off = [7, 248, 249, 250, 251, 307, 308, 309, 310, 311, 312]
+    off = [7, 259, 260, 261, 262, 263, 319, 320, 321, 322, 323]
     with emulator() as made, driver(port_of(made), f"devices.dm.limits.disabled={off}") as mirror:
         assert made.server.calls[0] == ("SET_DISABLED", (tuple(off), "devices.dm.limits.disabled"))
         report = mirror.send(np.full(336, 0.01))
         assert report.guard.disabled == 11
         name, what = made.server.calls[-1]
         assert name == "COMMAND"
-        assert not np.asarray(what)[[7, 248, 312]].any()
+        assert not np.asarray(what)[[7, 259, 323]].any()
 
 
 def test_acknowledgements_bring_positions_and_times() -> None:
@@ -209,7 +209,7 @@ def test_parameters_are_set_and_read_back() -> None:
         ("devices.dm.serial=OTHER", DeviceError, "is 'SIM336', not 'OTHER'"),
         ("devices.dm.limits.max_stroke=0.9", SettingRejected, "skips commands beyond 0.8"),
         ("devices.dm.limits.max_slew=0.6", SettingRejected, "max_slew is 0.6"),
-        ("devices.dm.limits.disabled=[1]", SettingRejected, r"disabled = \[1, 248, 249, 250, 251, 307"),
+        ("devices.dm.limits.disabled=[1]", SettingRejected, r"disabled = \[1, 259, 260, 261, 262, 263"),
         ("devices.dm.layout=rings-672", DeviceError, "has 336 actuators"),
     ],
 )
@@ -225,7 +225,7 @@ def test_another_mirror_than_configured_is_refused(
 
 
 def test_new_contamination_is_reported_with_the_line_to_configure() -> None:
-    with emulator(contaminated="17") as made, pytest.raises(SettingRejected, match=r"disabled = \[17, 248"):
+    with emulator(contaminated="17") as made, pytest.raises(SettingRejected, match=r"disabled = \[17, 259"):
         driver(port_of(made)).open()
 
 
