@@ -55,6 +55,8 @@ class InterruptHandler:
 
     def __init__(self, notify: Callable[[str], None]) -> None:
         self.abort = SignalSafeFlag()
+        #: Whether a signal has raised ``KeyboardInterrupt``.
+        self.interrupted = False
         self._notify = notify
         self._in_procedure = False
         self._protected_activity = ""
@@ -114,6 +116,7 @@ class InterruptHandler:
             self.abort.set()
             self._notify("stopping: the mirror is flattened and the data are saved")
         else:
+            self.interrupted = True
             raise KeyboardInterrupt
 
 
@@ -340,6 +343,9 @@ class CommandContext:
             return USAGE, type(error).__name__, str(error)
         if isinstance(error, EscapeError):
             return error.exit_code, type(error).__name__, str(error)
+        if self.interrupts.interrupted:
+            # A library that is being imported may turn the interruption into an error of its own.
+            return ABORTED, "Aborted", f"interrupted by Ctrl-C ({type(error).__name__})"
         if _is_file_error(error):
             message = f"{_shorten(os.fsdecode(error.filename))}: {error.strerror or error}"
             return (FAILED if self.devices_opened else USAGE), "StorageError", message

@@ -124,7 +124,7 @@ def test_environments(campaign: Campaign, place: Path) -> None:
     rng, another = random.Random(SEED), other_user()
     tried = commands(place / "im.fits", place / "small.toml")
     homes = {
-        "usual": str(place / "home"), "missing": "/nonexistent", "unreadable": str(place / "secret"),
+        "usual": str(place / "home"), "missing": str(place / "missing"), "unreadable": str(place / "secret"),
         "a file": str(place / "file"), "empty": "", "relative": "home",
     }  # fmt: skip
     kept = {name: value for name, value in os.environ.items() if not name.startswith(("XDG_", "PYTHONIO"))}

@@ -85,3 +85,18 @@ def test_ctrl_c_in_a_reproduction_keeps_what_is_done(document, bench, tmp_path, 
     assert sum(not path.name.endswith(".partial.fits") for path in paths) == done
     assert bench.benches[0].closed
     assert bench.benches[0].screen.state.inserted
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interruption_that_a_library_turns_into_its_own_error(document, monkeypatch, number):
+    def load(*_, **__):
+        try:
+            os.kill(os.getpid(), number)
+        except KeyboardInterrupt:
+            raise ValueError("half of a module") from None
+
+    monkeypatch.setattr("escape_hw.cli.context.CommandContext.load_config", load)
+    code, found, err = document("config", "check", "razor-shwfs")
+    assert code == 130
+    assert found["error"]["type"] == "Aborted"
+    assert "Traceback" not in err
