@@ -24,7 +24,7 @@ from escape_hw.calibration.sprint.covariance import sandwich_covariance, systema
 from escape_hw.calibration.sprint.diagnostics import describe_degeneracies
 from escape_hw.calibration.sprint.extra_parameters import build_extra_parameters
 from escape_hw.calibration.sprint.goodness_of_fit import check_fit
-from escape_hw.calibration.sprint.mixed_effects import GAIN, WIDTH, PriorEstimate
+from escape_hw.calibration.sprint.mixed_effects import GAIN, WIDTH, MixedEffectsState, PriorEstimate
 from escape_hw.calibration.sprint.mode_choice import choose_modes
 from escape_hw.calibration.sprint.normal_equations import Priors
 from escape_hw.calibration.sprint.solvers import MAX_STEP, SolverContext, SprintSolution, solve
@@ -103,11 +103,14 @@ class SprintFit:
         effects included: the matrix of the real mirror rather than of the nominal one.
     estimate_priors
         Estimates the scatter of the random effects from the data; ``None`` for solvers without them.
+    state
+        Values of all parameters and random effects, likewise.
     """
 
     estimate: RegistrationEstimate
     zonal_matrix: Callable[[], NDArray[np.float64]]
     estimate_priors: Callable[[], PriorEstimate] | None = None
+    state: MixedEffectsState | None = None
 
 
 @renamed_keywords(
@@ -227,8 +230,12 @@ def fit_registration(
     coarse_search: bool = True,
     extra_parameters: Sequence[ExtraParameter] = (),
     actuator_model: ActuatorModel = "fitted",
+    state: MixedEffectsState | None = None,
 ) -> Procedure[SprintFit]:
-    """SPRINT as a procedure; parameters and errors as for :func:`sprint`."""
+    """SPRINT as a procedure; parameters and errors as for :func:`sprint`.
+
+    The mixed-effects fit starts at ``state``, that of an earlier fit with the same model and sub-apertures.
+    """
     if not 0 < learning_rate <= 1:
         raise ValueError(f"learning_rate is {learning_rate}; it must lie in (0, 1]")
     solver = present_value("calibration.solver", solver)
@@ -255,7 +262,7 @@ def fit_registration(
         build_extra_parameters(model, extra_parameters),
     )  # fmt: skip
     weighted, solution = yield from _in_one_thread(
-        _solve_with_updates(context, weighted, initial.to_array(), coarse_search, update_priors, loss)
+        _solve_with_updates(context, weighted, initial.to_array(), coarse_search, update_priors, loss, state)
     )
     with limit_to_one_thread():
         estimate = _build_estimate(context, weighted, solution, covariance)
@@ -263,7 +270,7 @@ def fit_registration(
         if actuator_model == "fitted" and solution.actuator_corrections is not None:
             estimate = replace(estimate, actuator_corrections=solution.actuator_corrections())
     yield context.progress(estimate.sigma)
-    return SprintFit(estimate, solution.zonal_matrix, solution.estimate_priors)
+    return SprintFit(estimate, solution.zonal_matrix, solution.estimate_priors, solution.state)
 
 
 def estimate_registration(
@@ -299,17 +306,18 @@ def _solve_with_updates(
     coarse_search: bool,
     update_priors: bool,
     loss: Loss,
+    state: MixedEffectsState | None,
 ) -> Procedure[tuple[WeightedMatrix, SprintSolution]]:
     """Solve, then again with priors and outlier weights from the data; the last weights and solution."""
-    solution = yield from solve(context, weighted, start, coarse_search)
+    solution = yield from solve(context, weighted, start, coarse_search, state)
     if update_priors and solution.estimate_priors is not None:
         context.priors = solution.estimate_priors().priors
-        solution = yield from solve(context, weighted, solution.alpha, False)
+        solution = yield from solve(context, weighted, solution.alpha, False, solution.state)
     without_huber = weighted
     for _ in range(HUBER_ITERATIONS if loss == "huber" else 0):
         fitted = without_huber.weigh(solution.zonal_matrix() @ without_huber.modes)
         weighted = without_huber.with_slope_weights(huber_weights(without_huber.data - fitted))
-        solution = yield from solve(context, weighted, solution.alpha, False)
+        solution = yield from solve(context, weighted, solution.alpha, False, solution.state)
     return weighted, solution
 
 

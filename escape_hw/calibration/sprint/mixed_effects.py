@@ -90,6 +90,8 @@ class MixedEffectsProblem:
         such as optical gains that depend on the mode; fitted after the model's own variants and ``extras``.
     extras
         Extra parameters, fitted after the model's own variants.
+    shape
+        Terms of the shape of this model's influence functions, if they exist already.
     """
 
     def __init__(
@@ -99,6 +101,7 @@ class MixedEffectsProblem:
         priors: Priors,
         command_curves: Sequence[NDArray[np.float64]] = (),
         extras: Sequence[ExtraParameterModel] = (),
+        shape: InfluenceShape | None = None,
     ) -> None:
         self.weighted, self.command_curves, self.priors = weighted, tuple(command_curves), priors
         self.extras = tuple(extras)
@@ -109,7 +112,7 @@ class MixedEffectsProblem:
         # The x slopes of a column of sub-apertures share a sampling position, and the y slopes of a row.
         self.lines = np.unique(np.concatenate([cols, weighted.valid.shape[1] + rows]), return_inverse=True)[1]
         self.n_lines = int(self.lines.max()) + 1
-        self.shape = InfluenceShape(model)
+        self.shape = shape or InfluenceShape(model)
         self.trends = slope_trends(model, weighted.valid)
         self.precision = np.concatenate([
             np.zeros(6), [priors.width**-2], (priors.shape_scale * self.shape.prior_sigma) ** -2.0,

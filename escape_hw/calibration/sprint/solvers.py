@@ -21,6 +21,7 @@ from escape_hw.api.synthetic_model import HasSlopeWeights, SyntheticModel
 from escape_hw.calibration.sprint.coarse_search import low_mode_problem, search_registration
 from escape_hw.calibration.sprint.covariance import LinearisedProblem
 from escape_hw.calibration.sprint.extra_parameters import ExtraParameterModel, FittedExtraParameter
+from escape_hw.calibration.sprint.influence_shape import InfluenceShape
 from escape_hw.calibration.sprint.least_squares import (
     NEGLIGIBLE_STEP,
     BatchProblem,
@@ -61,8 +62,10 @@ class SolverContext:
     extras: tuple[ExtraParameterModel, ...] = ()
     history: list[SprintIteration] = field(default_factory=list)
     report: Reporter = field(init=False)
+    shape: InfluenceShape = field(init=False)
 
     def __post_init__(self) -> None:
+        self.shape = InfluenceShape(self.model)
         self.report = Reporter("SPRINT", self.max_iterations, "iteration")
 
     def progress(self, sigma: NDArray[np.float64] | None = None) -> Progress:
@@ -100,6 +103,8 @@ class SprintSolution:
         The fitted extra parameters.
     remaining_step
         The full step of the registration at the end ``(5,)``.
+    state
+        Values of all parameters and random effects; ``None`` for solvers without random effects.
     """
 
     system: LinearisedProblem
@@ -113,14 +118,20 @@ class SprintSolution:
     extras: tuple[FittedExtraParameter, ...] = ()
     actuator_corrections: Callable[[], ActuatorCorrections] | None = None
     remaining_step: NDArray[np.float64] | None = None
+    state: MixedEffectsState | None = None
 
 
 def solve(
-    context: SolverContext, weighted: WeightedMatrix, start: NDArray[np.float64], coarse_search: bool
+    context: SolverContext,
+    weighted: WeightedMatrix,
+    start: NDArray[np.float64],
+    coarse_search: bool,
+    state: MixedEffectsState | None = None,
 ) -> Procedure[SprintSolution]:
     """Solve for weighted columns, from a registration ``start (5,)``, with the solver of the context.
 
     The iterations are recorded in the context. With ``coarse_search`` the start is searched from far away.
+    A ``state`` of an earlier solution is where the mixed-effects fit starts.
     """
     model, solver, rate = context.model, context.solver, context.learning_rate
     n = context.max_iterations
@@ -140,8 +151,11 @@ def solve(
         fit = yield from _record_steps(search, context)
         start = fit.alpha
     if solver == "mixed-effects":
-        problem = MixedEffectsProblem(weighted, model, context.priors, extras=context.extras)
-        return (yield from _fit_mixed_effects(problem, Registration.from_array(start), context))
+        problem = MixedEffectsProblem(
+            weighted, model, context.priors, extras=context.extras, shape=context.shape
+        )
+        state = state or problem.initial_state(Registration.from_array(start))
+        return (yield from _fit_mixed_effects(problem, state, context))
     # The coarse search ignores slope weights.
     if not coarse_search or isinstance(model, HasSlopeWeights):
         steps = LeastSquaresProblem(weighted, model, rate, frozen).descend(start, n)
@@ -173,11 +187,10 @@ def _record_steps(steps: Generator[LeastSquaresFit, None, T], context: SolverCon
 
 
 def _fit_mixed_effects(
-    problem: MixedEffectsProblem, start: Registration, context: SolverContext
+    problem: MixedEffectsProblem, state: MixedEffectsState, context: SolverContext
 ) -> Procedure[SprintSolution]:
-    """Gauss-Newton iteration on registration and random effects together."""
-    state, steps_converged = problem.initial_state(start), False
-    system = problem.linearise(state)
+    """Gauss-Newton iteration on registration and random effects together, from a state."""
+    system, steps_converged = problem.linearise(state), False
     rate, previous_step = context.learning_rate, np.zeros(5)
     for _ in range(context.max_iterations):
         if context.report.step():
@@ -199,6 +212,8 @@ def _fit_mixed_effects(
             rate /= 2
             if rate < _MIN_RATE_FRACTION * context.learning_rate:
                 break
+        else:
+            rate = min(2 * rate, context.learning_rate)
         previous_step = step[1:6] / MAX_STEP
         damping = min(1.0, 1.0 / float(np.max(np.abs(step[1:6]) / MAX_STEP)))
         step = step * damping * rate
@@ -212,7 +227,7 @@ def _fit_mixed_effects(
         estimate_priors=lambda: problem.estimate_priors(state, system),
         actuator_corrections=lambda: problem.actuator_corrections(state, system),
         extras=problem.extra_parameter_values(state),
-        remaining_step=remaining_step,
+        remaining_step=remaining_step, state=state,
     )  # fmt: skip
 
 

@@ -162,7 +162,7 @@ def fit_telemetry(
     """
     filters = [np.ones(1), np.array([1.0, -1.0])][: 2 if order else 1]
     matrix = template.data.astype(np.float64) if data.closed else None
-    priors, n_effective_parameters = Priors(), 0.0
+    priors, n_effective_parameters, state = Priors(), 0.0, None
     rounds = _CLOSED_LOOP_ROUNDS if data.closed else _OPEN_LOOP_ROUNDS
     for number in range(rounds):
         frames = _WhitenedFrames.from_telemetry(data, filters, lags)
@@ -187,9 +187,9 @@ def fit_telemetry(
         fit = yield from fit_registration(
             frames.columns(template, response.weights, matrix, variance), model, start=start,
             covariance=covariance, priors=priors, update_priors=False, coarse_search=start is None,
-            **iteration_options,
+            state=state, **iteration_options,
         )  # fmt: skip
-        start = fit.estimate.registration
+        state, start = fit.state, fit.estimate.registration
         matrix = fit.zonal_matrix() @ template.m2c
         if fit.estimate_priors is not None:
             prior_estimate = fit.estimate_priors()

@@ -45,7 +45,7 @@ class TipTiltFreeModel:
     """
 
     def __init__(self, model: SyntheticModel) -> None:
-        self._model = model
+        self._model: Any = model
 
     def zonal_matrix(self, registration: Registration, width: float = 1.0) -> NDArray[np.float64]:
         """Slopes per unit command ``(n_slopes, n_act)``."""
@@ -75,5 +75,12 @@ class TipTiltFreeModel:
         """The model's variants, treated alike."""
         return [TipTiltFreeModel(variant) for variant in self._model.variants()]
 
+    def component_model(self) -> TipTiltFreeModel:
+        """The model of one function of the profile, treated alike."""
+        return TipTiltFreeModel(self._model.component_model())
+
     def __getattr__(self, name: str) -> Any:
-        return getattr(self._model, name)
+        attribute = getattr(self._model, name)
+        if name == "with_pupil_shift":  # another model, treated alike
+            return lambda *shift: TipTiltFreeModel(attribute(*shift))
+        return attribute
