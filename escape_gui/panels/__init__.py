@@ -1,4 +1,7 @@
-"""The panels, one per module, and their list ``PANELS``."""
+"""The panels, one per module, and their list ``PANELS``.
+
+Their content is computed in ``views`` and drawn with ``widgets``; requests are sent by ``client``.
+"""
 
 from __future__ import annotations
 
