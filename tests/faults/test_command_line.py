@@ -228,7 +228,7 @@ def test_too_few_frames_no_light_and_no_response_exit_1(run, system, tmp_path):
     dark = ("--set", "twin.wfs.photons_per_frame=1")
     code, document, _ = run("calibrate", system, "--frames", 300, *dark, "--out", tmp_path / "b")
     assert (code, document["error"]["type"]) == (1, "CalibrationError")
-    assert "no spots" in document["error"]["message"]
+    assert "no illuminated pupil" in document["error"]["message"]
     still = ("--set", "devices.dm.stroke_m=1e-12")
     code, document, _ = run("calibrate", system, "--frames", 300, *still, "--out", tmp_path / "c")
     assert (code, document["error"]["type"]) == (1, "CalibrationError")
