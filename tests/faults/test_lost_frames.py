@@ -49,7 +49,7 @@ def test_the_same_matrix_within_its_noise(good, runs, loss):
         without = np.mean([compare(other, good)[0] for other in runs[0.0]])
         # Errors of the same mode go together from slope to slope, so chi-squared scatters more than its name.
         assert chi2 == pytest.approx(without, abs=0.3)
-        assert chi2 == pytest.approx(1, abs=0.35)
+        assert chi2 == pytest.approx(1, abs=0.45)
         assert gain == pytest.approx(1, abs=0.02)
         delay = runs[0.0][0].result.response.delay_frames
         assert run.result.response.delay_frames == pytest.approx(delay, abs=0.02)
@@ -90,7 +90,7 @@ def test_every_tenth_frame_lost_by_the_camera(good):
         assert run.result.lost_frames == pytest.approx(FRAMES / 9, abs=2)
         assert_flat(bench)
     chi2, gain = compare(run, good)
-    assert chi2 == pytest.approx(1, abs=0.35)
+    assert chi2 == pytest.approx(1, abs=0.45)
     assert gain == pytest.approx(1, abs=0.02)
 
 

@@ -294,7 +294,8 @@ class MixedEffectsProblem:
             inner - N_ACTUATOR_EFFECTS * self.model.n_act :
         ]
         noise = self.weighted.noise_level(system.residual)
-        gain_sigma = noise * np.sqrt(variance[: self.model.n_act])
+        # Rounding makes variances negative where a solution that is refused has no information.
+        gain_sigma = noise * np.sqrt(np.maximum(variance[: self.model.n_act], 0.0))
         gain, width, *position = state.actuator
         return ActuatorCorrections(gain, gain_sigma, width, state.shape, np.array(position))
 

@@ -212,7 +212,7 @@ def _fit_mixed_effects(
             rate /= 2
             if rate < _MIN_RATE_FRACTION * context.learning_rate:
                 break
-        else:
+        elif norm < np.linalg.norm(previous_step):
             rate = min(2 * rate, context.learning_rate)
         previous_step = step[1:6] / MAX_STEP
         damping = min(1.0, 1.0 / float(np.max(np.abs(step[1:6]) / MAX_STEP)))
