@@ -7,6 +7,7 @@ import pytest
 
 from escape_hw.api.adaptive_secondary import STATE_ORDER, AdaptiveSecondary, ShellState
 from escape_hw.config.loader import load_system
+from escape_hw.config.registry import DeviceContext
 from escape_hw.errors import DeviceError, NotOpen
 from escape_sim.devices.twins import SimAdaptiveSecondary, make_secondary
 from escape_sim.mirror.shell import FLOATING_GAP_M
@@ -20,7 +21,8 @@ QUICK = [
 
 
 def twin(*overrides: str) -> SimAdaptiveSecondary:
-    return make_secondary("asm", load_system("razor-shwfs", overrides=[*QUICK, *overrides]), {})
+    config = load_system("razor-shwfs", overrides=[*QUICK, *overrides])
+    return make_secondary(None, DeviceContext("asm", config))
 
 
 def wait(mirror: SimAdaptiveSecondary, seconds: float = 0.05) -> None:

@@ -42,8 +42,9 @@ T = TypeVar("T")
 MAX_STEP = np.array([60.0, 60.0, 2.0, 4.0, 4.0])
 #: A step is halved, at most so many times, while it increases the cost by more than this factor.
 _MAX_HALVINGS, _COST_TOLERANCE = 6, 1.02
-#: Oscillating steps are shortened down to this fraction of the learning rate; then the descent gives up.
-_MIN_RATE_FRACTION = 0.125
+#: Oscillating steps are shortened down to this fraction of the learning rate, and so many times; then the
+#: descent gives up.
+_MIN_RATE_FRACTION, _MAX_REVERSALS = 0.125, 12
 #: Solvers that group or scale the columns as modes, and so need a matrix rather than telemetry.
 MATRIX_ONLY_SOLVERS: tuple[Solver, ...] = ("batches", "diagonal")
 
@@ -191,7 +192,7 @@ def _fit_mixed_effects(
 ) -> Procedure[SprintSolution]:
     """Gauss-Newton iteration on registration and random effects together, from a state."""
     system, steps_converged = problem.linearise(state), False
-    rate, previous_step = context.learning_rate, np.zeros(5)
+    rate, previous_step, reversals = context.learning_rate, np.zeros(5), 0
     for _ in range(context.max_iterations):
         if context.report.step():
             yield context.progress()
@@ -209,8 +210,8 @@ def _fit_mixed_effects(
             break
         if step[1:6] / MAX_STEP @ previous_step < -0.5 * (previous_step @ previous_step):
             # Oscillation: nonlinearity of the model reverses each step.
-            rate /= 2
-            if rate < _MIN_RATE_FRACTION * context.learning_rate:
+            rate, reversals = rate / 2, reversals + 1
+            if rate < _MIN_RATE_FRACTION * context.learning_rate or reversals > _MAX_REVERSALS:
                 break
         elif norm < np.linalg.norm(previous_step):
             rate = min(2 * rate, context.learning_rate)
