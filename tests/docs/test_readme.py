@@ -16,7 +16,7 @@ TOUR = (ROOT / "docs" / "commands.md").read_text(encoding="utf-8")
 #: Minutes each; that their words are right is checked all the same.
 LONG = (
     "escape reproduce shwfs", "escape reproduce table1", "escape reproduce pywfs",
-    "escape reproduce maps", "escape reproduce sky-time", "escape report run",
+    "escape reproduce maps", "escape reproduce revolt", "escape reproduce sky-time", "escape report run",
     "escape calibrate razor-pywfs", "escape gains razor-pywfs", "escape sweep", "escape reproduce all",
 )  # fmt: skip
 
