@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 import json
 import random
+import shutil
+import subprocess
 from collections.abc import Callable
 from html.parser import HTMLParser
 from pathlib import Path
@@ -60,6 +62,24 @@ def elements(page: Path) -> Elements:
     return found
 
 
+#: Tells whether one of the payloads was run; stands before everything else in the page.
+WITNESS = "<script>window.alert = () => document.documentElement.setAttribute('data-ran', 'yes')</script>"
+QUIET = (
+    "--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-background-networking",
+    "--disable-component-update", "--disable-sync", "--virtual-time-budget=2000", "--dump-dom",
+)  # fmt: skip
+
+
+def runs_a_script(browser: str, page: str, folder: Path) -> bool:
+    """Whether a browser runs one of the payloads of a page."""
+    copy = folder / "page.html"
+    copy.write_text(WITNESS + page, encoding="utf-8")
+    words = [browser, *QUIET, f"--user-data-dir={folder / 'profile'}", copy.as_uri()]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=120, check=True)
+    assert "window.alert" in done.stdout
+    return 'data-ran="yes"' in done.stdout
+
+
 def make_run(folder: Path, name: Callable[[str], str]) -> Path:
     """A run folder whose texts are passed through ``name``."""
     with RunFolder("razor-shwfs", "test", folder) as run:
@@ -99,6 +119,9 @@ def test_reports(campaign: Campaign, tmp_path: Path) -> None:
     def sometimes(text: str, probability: float = 0.03) -> str:
         return rng.choice(PAYLOADS) if rng.random() < probability else text
 
+    browser = shutil.which("chromium")
+    if browser:
+        assert runs_a_script(browser, PAYLOADS[0], tmp_path)
     usual = elements(write_report(make_run(tmp_path / "usual", lambda text: text)))
     assert not usual.active
     assert "script" not in usual.tags
@@ -107,7 +130,8 @@ def test_reports(campaign: Campaign, tmp_path: Path) -> None:
         file = run / RESULT_FILE
         file.write_text(json.dumps(spoil(json.loads(file.read_text()), sometimes)))
         try:
-            found = elements(write_report(run))
+            page = write_report(run)
+            found = elements(page)
         except EscapeError:
             campaign.count("refused")
             continue
@@ -117,6 +141,8 @@ def test_reports(campaign: Campaign, tmp_path: Path) -> None:
         strange = found.tags - usual.tags
         if strange or found.active:
             campaign.fail(f"{number}: {sorted(strange)} {found.active}")
+        elif browser and runs_a_script(browser, page.read_text(encoding="utf-8"), tmp_path):
+            campaign.fail(f"{number}: a script ran in the browser")
         else:
-            campaign.count("harmless page")
+            campaign.count("harmless page" + (", also in Chromium" if browser else ""))
     campaign.end("reports of runs with hostile names")
