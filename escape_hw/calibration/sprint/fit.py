@@ -23,7 +23,7 @@ from escape_hw.calibration.modes.derivatives import modal_matrix
 from escape_hw.calibration.sprint.covariance import sandwich_covariance, systematic_error
 from escape_hw.calibration.sprint.diagnostics import describe_degeneracies
 from escape_hw.calibration.sprint.extra_parameters import build_extra_parameters
-from escape_hw.calibration.sprint.goodness_of_fit import check_fit
+from escape_hw.calibration.sprint.goodness_of_fit import check_fit, describe_misfit
 from escape_hw.calibration.sprint.mixed_effects import GAIN, WIDTH, MixedEffectsState, PriorEstimate
 from escape_hw.calibration.sprint.mode_choice import choose_modes
 from escape_hw.calibration.sprint.normal_equations import Priors
@@ -385,6 +385,7 @@ def _build_estimate(
     index = {name: k for k, name in enumerate(_PARAMETER_NAMES[: len(covariance)])}
     index.update({one.model.name: one.index for one in solution.extras})
     notes = describe_degeneracies(covariance[np.ix_([*index.values()], [*index.values()])], [*index])
+    notes += describe_misfit(weighted, solution.system.residual)
     if solution.added_covariance is not None:
         covariance[1:6, 1:6] += solution.added_covariance
     model_sigma = systematic_error(context.model)

@@ -21,6 +21,8 @@ from escape_hw.calibration.sprint.weighted_matrix import WeightedMatrix
 #: Largest rms of the residual beyond the noise, relative to that of the matrix. A tenth is what the best
 #: known description of a real mirror leaves; beyond it scalings and rotation are those of a wrong model.
 _MAX_MISFIT = 0.15
+#: The same from which on a note tells that the model does not fit to within the noise.
+_NOTABLE_MISFIT = 0.02
 #: Excess of the sum of squares, in its standard deviations for independent noise, that counts as a misfit.
 _SIGNIFICANT = 10.0
 #: Norm of the fitted matrix in standard errors below which the sensor does not see the mirror: the largest of
@@ -31,6 +33,7 @@ _MAX_SCALING, _MAX_ROTATION = 20.0, 30.0
 #: A sub-aperture or actuator whose rms residual exceeds the median one by this factor is named, so many at
 #: most.
 _OUTLIER, _MAX_NAMED = 3.0, 12
+_EVEN = "no part stands out"
 
 
 def misfit_fraction(weighted: WeightedMatrix, residual: NDArray[np.float64]) -> float:
@@ -52,6 +55,25 @@ def misfit_fraction(weighted: WeightedMatrix, residual: NDArray[np.float64]) -> 
     if excess <= _SIGNIFICANT * np.sqrt(2.0 * n) or signal <= 0:
         return 0.0
     return float(np.sqrt(excess / signal))
+
+
+def describe_misfit(weighted: WeightedMatrix, residual: NDArray[np.float64]) -> tuple[str, ...]:
+    """A note that the model does not fit to within the noise, with what fits worst; empty if it does.
+
+    Parameters
+    ----------
+    weighted, residual
+        As for :func:`misfit_fraction`. Without standard errors the residual may be noise, and none is given.
+    """
+    misfit = misfit_fraction(weighted, residual) if weighted.has_standard_errors else 0.0
+    if not _NOTABLE_MISFIT < misfit <= _MAX_MISFIT:
+        return ()
+    outliers = describe_outliers(weighted, residual)
+    return (
+        f"the model does not fit to within the noise: {misfit:.0%} of the matrix remain beyond it (reduced "
+        f"chi-squared {np.mean(np.square(residual)):.3g}), which the standard errors include as far as "
+        f"leaving out parts of the matrix shows it; {f'worst: {outliers}' if outliers else _EVEN}",
+    )
 
 
 def describe_outliers(weighted: WeightedMatrix, residual: NDArray[np.float64]) -> str:
@@ -118,7 +140,7 @@ def check_fit(
         )
     elif misfit > _MAX_MISFIT:
         outliers = describe_outliers(weighted, residual)
-        where = f"worst: {outliers}" if outliers else "no part stands out"
+        where = f"worst: {outliers}" if outliers else _EVEN
         reasons.append(
             f"the model does not fit: {misfit:.0%} of the matrix remain beyond its noise (reduced "
             f"chi-squared {np.mean(np.square(residual)):.3g}); {where}"
