@@ -40,7 +40,7 @@ T = TypeVar("T")
 #: linear, and more so with random effects, so it is half that of the registration-only solvers. Step norms
 #: of all solvers are in this unit.
 MAX_STEP = np.array([60.0, 60.0, 2.0, 4.0, 4.0])
-#: A step is halved, at most so many times, while it increases the cost by more than this factor.
+#: A step is halved, at most so many times, while its cost exceeds the lowest so far by more than this factor.
 _MAX_HALVINGS, _COST_TOLERANCE = 6, 1.02
 #: Oscillating steps are shortened down to this fraction of the learning rate, and so many times; then the
 #: descent gives up.
@@ -193,6 +193,7 @@ def _fit_mixed_effects(
     """Gauss-Newton iteration on registration and random effects together, from a state."""
     system, steps_converged = problem.linearise(state), False
     rate, previous_step, reversals = context.learning_rate, np.zeros(5), 0
+    lowest_cost = _cost(problem, state, system)
     for _ in range(context.max_iterations):
         if context.report.step():
             yield context.progress()
@@ -218,7 +219,11 @@ def _fit_mixed_effects(
         previous_step = step[1:6] / MAX_STEP
         damping = min(1.0, 1.0 / float(np.max(np.abs(step[1:6]) / MAX_STEP)))
         step = step * damping * rate
-        state, system = _take_step(problem, state, system, step)
+        trial = _take_step(problem, state, step, _COST_TOLERANCE * lowest_cost)
+        if trial is None:
+            break
+        state, system = trial
+        lowest_cost = min(lowest_cost, _cost(problem, state, system))
     else:
         # Not the last step, which was a fraction of the full one, but the full step from where it led.
         remaining_step = system.solve()[1:6]
@@ -233,21 +238,20 @@ def _fit_mixed_effects(
 
 
 def _take_step(
-    problem: MixedEffectsProblem, state: MixedEffectsState, system: NormalEquations, step: NDArray[np.float64]
-) -> tuple[MixedEffectsState, NormalEquations]:
-    """The state after a step, halved while it clearly increases the cost.
+    problem: MixedEffectsProblem, state: MixedEffectsState, step: NDArray[np.float64], largest_cost: float
+) -> tuple[MixedEffectsState, NormalEquations] | None:
+    """The state after a step, halved while its cost is larger than ``largest_cost``; ``None`` if it stays so.
 
     The problem is bilinear in gain and variant shares, so on a pyramid far from the model without
     modulated light a full step may overshoot.
     """
-    largest_cost = _COST_TOLERANCE * _cost(problem, state, system)
     for _ in range(_MAX_HALVINGS):
         trial_state = problem.move(state, step)
         trial_system = problem.linearise(trial_state)
         if _cost(problem, trial_state, trial_system) <= largest_cost:
-            break
+            return trial_state, trial_system
         step = step / 2
-    return trial_state, trial_system
+    return None
 
 
 def _cost(problem: MixedEffectsProblem, state: MixedEffectsState, system: NormalEquations) -> float:
