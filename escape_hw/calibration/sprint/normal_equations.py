@@ -129,9 +129,7 @@ class NormalEquations:
                 self, inner=inner, diagonal=diagonal, schur_complement=schur_complement, precision=precision,
                 _elimination=None,
             )  # fmt: skip
-        return replace(
-            system, residual=residual, right_hand_side=self._scores(residual) - precision * offset
-        )
+        return replace(system, residual=residual, right_hand_side=self._scores(residual) - precision * offset)
 
     def _scores(self, residual: NDArray[np.float64]) -> NDArray[np.float64]:
         """Products of all derivatives with a residual, in the order of the unknowns."""

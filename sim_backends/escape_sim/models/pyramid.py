@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -173,6 +174,16 @@ class PyramidModel(DesignModel):
             return self._slopes(np.moveaxis(self._surfaces(self._nodes, registration, width), 0, 2))
         factors = self._factors(self._nodes, registration, width)
         return self._slopes(_zonal_surfaces(factors, 0, 0))
+
+    def zonal_sum(
+        self, functions: Sequence[tuple[NDArray[np.float64] | float, Registration, float]]
+    ) -> NDArray[np.float64]:
+        """Slopes of a sum of influence functions ``(n_slopes, n_act)``, see :class:`SummingModel`."""
+        surfaces = np.zeros((self._nodes.size, self._nodes.size, self.n_act), np.float32)
+        for factor, registration, width in functions:
+            factors = self._factors(self._nodes, registration, width)
+            surfaces += _zonal_surfaces(factors, 0, 0) * np.asarray(factor, np.float32)
+        return self._slopes(surfaces)
 
     def modal_matrix(
         self, registration: Registration, m2c: NDArray[np.float64], width: float = 1.0
