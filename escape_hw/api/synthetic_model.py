@@ -178,10 +178,7 @@ class DifferentiableModel(SyntheticModel, Protocol):
 
 @runtime_checkable
 class SummingModel(SyntheticModel, Protocol):
-    """A synthetic model that adds influence functions before it computes their slopes.
-
-    Optional, for sensors whose response is a large product.
-    """
+    """A synthetic model that computes sums of influence functions faster than their matrices one by one."""
 
     def zonal_sum(
         self, functions: Sequence[tuple[NDArray[np.float64] | float, Registration, float]]

@@ -118,7 +118,7 @@ class MixedEffectsProblem:
         self.lines = np.unique(np.concatenate([cols, weighted.valid.shape[1] + rows]), return_inverse=True)[1]
         self.n_lines = int(self.lines.max()) + 1
         self.shape = earlier.shape if earlier else InfluenceShape(model)
-        self._kept = earlier._kept if earlier and earlier.weighted is weighted else None
+        self.kept = earlier.kept if earlier and earlier.weighted is weighted else None
         self.trends = slope_trends(model, weighted.valid)
         self.precision = np.concatenate([
             np.zeros(6), [priors.width**-2], (priors.shape_scale * self.shape.prior_sigma) ** -2.0,
@@ -227,7 +227,7 @@ class MixedEffectsProblem:
 
     def linearise(self, state: MixedEffectsState) -> NormalEquations:
         """Model and derivatives about a state."""
-        if self._kept is not None and (system := self._update_kept(state, *self._kept)):
+        if self.kept is not None and (system := self._update_kept(state, *self.kept)):
             return system
         z = self._zonal_matrices(state)
         actuator_factor = 1 + state.actuator_gain
@@ -248,7 +248,7 @@ class MixedEffectsProblem:
             common, self._actuator_derivatives(z, scale, actuator_factor), self.modes, model, residual,
             self.precision, self.offset(state), sampling_derivative, self.lines, self.trends,
         )  # fmt: skip
-        self._kept = z, system
+        self.kept = z, system
         return system
 
     def _update_kept(

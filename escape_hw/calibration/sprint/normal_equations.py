@@ -276,7 +276,7 @@ def normal_equations(
         member = np.zeros((len(model), 0))
     else:
         member = (lines[:, None] == np.arange(lines.max() + 1)).astype(float)
-    k, (n_slopes, n_modes), n_kinds = len(common), model.shape, len(actuator_derivatives)
+    k, n_kinds = len(common), len(actuator_derivatives)
     # All kinds side by side, so that products are few and large.
     zonal = np.concatenate(list(actuator_derivatives), axis=1)
     acting = (zonal.T @ zonal) * np.tile(modes @ modes.T, (n_kinds, n_kinds))

@@ -195,7 +195,8 @@ class PyramidModel(DesignModel):
         self, registration: Registration, m2c: NDArray[np.float64], width: float = 1.0
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Modal matrix and its derivatives, see :class:`DifferentiableModel`."""
-        surfaces = mode_derivatives(self._factors(self._nodes, registration, width), m2c)
+        factors = self._factors(self._nodes, registration, width, derivatives=True)
+        surfaces = mode_derivatives(factors, m2c)
         parts = self._slopes(surfaces.reshape(*surfaces.shape[:2], -1))
         parts = parts.reshape(-1, 1 + N_DERIVATIVES, m2c.shape[1]).transpose(1, 0, 2)
         return parts[0], parts[1:]
@@ -204,7 +205,7 @@ class PyramidModel(DesignModel):
         self, registration: Registration, width: float = 1.0
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Zonal matrix and its derivatives, see :class:`DifferentiableModel`."""
-        factors = self._factors(self._nodes, registration, width)
+        factors = self._factors(self._nodes, registration, width, derivatives=True)
         pairs = ((0, 0), (1, 0), (0, 1), (2, 0), (0, 2))
         parts = [self._slopes(_zonal_surfaces(factors, i, j)) for i, j in pairs]
         # By the positions along x and y, and by the logarithms of the widths along x and y.
