@@ -174,3 +174,19 @@ class DifferentiableModel(SyntheticModel, Protocol):
         self, registration: Registration, width: float = 1.0
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Slopes per unit command ``(n_slopes, n_act)``, and derivatives ``(6, n_slopes, n_act)``."""
+
+
+@runtime_checkable
+class SummingModel(SyntheticModel, Protocol):
+    """A synthetic model that computes sums of influence functions faster than their matrices one by one."""
+
+    def zonal_sum(
+        self, functions: Sequence[tuple[NDArray[np.float64] | float, Registration, float]]
+    ) -> NDArray[np.float64]:
+        """Slopes of a sum of influence functions per unit command ``(n_slopes, n_act)``.
+
+        Parameters
+        ----------
+        functions
+            Factor, a number or ``(n_act,)``, registration and width of each.
+        """

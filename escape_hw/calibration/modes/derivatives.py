@@ -6,13 +6,13 @@ differences otherwise.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from escape_hw.api.registration import Registration
-from escape_hw.api.synthetic_model import DifferentiableModel, SyntheticModel
+from escape_hw.api.synthetic_model import DifferentiableModel, SummingModel, SyntheticModel
 
 #: Half steps of the central differences: registration in its units, relative width of the influence
 #: functions.
@@ -55,6 +55,25 @@ def zonal_jacobian(
     if isinstance(model, DifferentiableModel):
         return model.zonal_jacobian(registration, width)
     return _central_differences(model.zonal_matrix, registration, width)
+
+
+def zonal_sum(
+    model: SyntheticModel, functions: Sequence[tuple[NDArray[np.float64] | float, Registration, float]]
+) -> NDArray[np.float64]:
+    """Slopes of a sum of influence functions per unit command ``(n_slopes, n_act)``.
+
+    Parameters
+    ----------
+    functions
+        Factor, a number or ``(n_act,)``, registration and width of each.
+    """
+    if isinstance(model, SummingModel):
+        return model.zonal_sum(functions)
+    (factor, *first), *others = functions
+    total = factor * model.zonal_matrix(*first)
+    for factor, registration, width in others:
+        total += factor * model.zonal_matrix(registration, width)
+    return total
 
 
 def _central_differences(

@@ -70,6 +70,8 @@ class LowRankNoise:
 
 #: Groups of actuators, and rings of sub-apertures, that are left out in turn.
 _N_GROUPS, _N_RINGS = 20, 4
+#: Slopes whose projections on all actuators are in memory at once.
+_SLOPES_AT_ONCE = 256
 
 
 def systematic_error(model: SyntheticModel) -> NDArray[np.float64]:
@@ -154,15 +156,19 @@ def _resampled_covariance(
     residual, modes
         Residual ``(n_slopes, n_modes)`` and modes ``(n_act, n_modes)``.
     """
-    inverse = np.linalg.pinv(modes)
-    zonal, commanded = scores @ inverse, scores @ modes.T
-    by_actuator = np.einsum("psa,sa->pa", zonal, residual @ modes.T)
-    groups = np.array_split(np.arange(len(modes)), min(_N_GROUPS, len(modes)))
-    information = np.einsum("psa,qsa->pqa", zonal, commanded, optimize=True)
+    (n, n_slopes, n_modes), n_act = scores.shape, len(modes)
+    inverse, commanded_residual = np.linalg.pinv(modes).T, modes @ residual.T
+    information, by_actuator = np.zeros((n_act, n, n)), np.zeros((n_act, n))
+    for first in range(0, n_slopes, _SLOPES_AT_ONCE):
+        part = slice(first, first + _SLOPES_AT_ONCE)
+        columns = scores[:, part].reshape(-1, n_modes).T
+        zonal, commanded = ((rows @ columns).reshape(n_act, n, -1) for rows in (inverse, modes))
+        information += zonal @ commanded.transpose(0, 2, 1)
+        by_actuator += (zonal @ commanded_residual[:, part, None])[:, :, 0]
     steps: list[NDArray[np.float64]] = []
-    for group in groups:
-        part = information[:, :, group].sum(axis=2)
-        steps.append(np.linalg.solve(total - (part + part.T) / 2, by_actuator[:, group].sum(axis=1)))
+    for group in np.array_split(np.arange(n_act), min(_N_GROUPS, n_act)):
+        left_out = information[group].sum(axis=0)
+        steps.append(np.linalg.solve(total - (left_out + left_out.T) / 2, by_actuator[group].sum(axis=0)))
     return _jackknife_covariance(steps)
 
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from escape_hw.api.registration import Registration
 from escape_hw.api.synthetic_model import PROFILE_WIDTHS, HasActuatorPositions, HasProfile, SyntheticModel
-from escape_hw.calibration.modes.derivatives import zonal_jacobian
+from escape_hw.calibration.modes.derivatives import zonal_jacobian, zonal_sum
 
 #: Lobes of the four-fold terms: distance in pitches, and width relative to the nominal one.
 _FOURFOLD_LOBES = ((0.4, 0.35), (0.8, 0.6), (1.6, 1.0))
@@ -137,6 +137,40 @@ class InfluenceShape:
             terms += [self._edge * part for part in (common, width * jacobian[5], *profile, *outward)]
         return ShapedMatrix(nominal, base, _add(nominal, coefficients, terms), jacobian, terms)
 
+    def matrix(
+        self,
+        registration: Registration,
+        width: float,
+        coefficients: NDArray[np.float64],
+        terms: list[NDArray[np.float64]],
+    ) -> NDArray[np.float64]:
+        """The shaped zonal matrix alone ``(n_slopes, n_act)``.
+
+        The four-fold terms and the derivatives in those of the edge actuators, a few per cent of the matrix,
+        are taken from ``terms``, those of :meth:`linearise` nearby.
+        """
+        n, edge = len(self._widths), 0.0 if self._edge is None else self._edge
+        profile, (edge_gain, edge_profile) = coefficients[:n], np.zeros((2, 1))
+        kept, kept_terms = coefficients[n:], terms[n:]
+        if self._edge is not None:
+            first = n + len(_FOURFOLD_LOBES)
+            edge_gain, edge_profile = coefficients[first], coefficients[first + 2 : first + 2 + n, None]
+            also = [*range(n, first), first + 1, *range(first + 2 + n, self.n_terms)]
+            kept, kept_terms = coefficients[also], [terms[k] for k in also]
+            kept = [c * (1 + edge_gain * edge) if k < first else c for k, c in zip(also, kept, strict=True)]
+        # Weights of the functions of every width and actuator; those of the profile replace the first one.
+        weights = profile[:, None] * (1 + edge_gain * edge) + edge_profile * edge
+        nominal = self._shares[:, None] * np.ones_like(weights[0]) * (1 + edge_gain * edge)
+        weights = nominal + np.concatenate([-weights.sum(axis=0, keepdims=True), weights])
+        matrix = zonal_sum(
+            self._model,
+            [
+                (w, registration, width * relative)
+                for w, relative in zip(weights, PROFILE_WIDTHS, strict=True)
+            ],
+        )
+        return _add(matrix, kept, kept_terms)
+
     def _outward_derivative(self, jacobian: NDArray[np.float64]) -> NDArray[np.float64]:
         """Derivative by outward positions of the actuators ``(n_slopes, n_act)``."""
         if self._edge is None:
@@ -151,7 +185,7 @@ class InfluenceShape:
         affine, _ = registration.affine(self._model.sub_aperture_m)
         terms = []
         for distance, relative_width in _FOURFOLD_LOBES:
-            term = np.zeros((0, 0))
+            lobes = []
             for number in range(_N_LOBES):
                 angle = 2 * np.pi * number / _N_LOBES
                 shift = affine @ (self._pitch * distance * np.array([np.cos(angle), np.sin(angle)]))
@@ -160,9 +194,8 @@ class InfluenceShape:
                     shift_x=registration.shift_x + float(shift[0]),
                     shift_y=registration.shift_y + float(shift[1]),
                 )
-                lobe = (-1) ** number * self._model.zonal_matrix(shifted, width * relative_width)
-                term = lobe if number == 0 else term + lobe
-            terms.append(term)
+                lobes.append(((-1.0) ** number, shifted, width * relative_width))
+            terms.append(zonal_sum(self._model, lobes))
         self._fourfold_at, self._fourfold = at, terms
         return terms
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
 
 from escape_hw.api.registration import Registration
 from escape_hw.api.results import ActuatorCorrections
@@ -32,6 +33,9 @@ _ACTUATOR_PRIORS = ("actuator_gain", "actuator_width", "actuator_position", "act
 N_ACTUATOR_EFFECTS = len(_ACTUATOR_PRIORS)
 #: Limits of the estimated scatter relative to the default priors.
 _MIN_PRIOR_RATIO, _MAX_PRIOR_RATIO = 0.05, 3.0
+#: Relative change of the fitted matrix below which derivatives are kept: they change by about as much. With
+#: five times as much, solutions for matrices of high signal-to-noise ratio differ by their stated errors.
+_KEEP_BELOW = 0.002
 #: Iterations of the empirical-Bayes fixed point, and relative change of all scatters that ends them.
 _ITERATIONS, _NEGLIGIBLE_CHANGE = 20, 0.02
 #: Zero effects that are added to the count of each group: the scatter of a few effects may be chance, and
@@ -69,7 +73,7 @@ class MixedEffectsState:
 
 @dataclass(slots=True, eq=False)
 class _ZonalMatrices:
-    """Zonal matrices at a state, in standard errors: derivatives, terms, variants, and their sum."""
+    """Zonal matrices at a state: derivatives, terms of the shape, variants, and their sum."""
 
     jacobian: NDArray[np.float64]
     by_width: NDArray[np.float64]
@@ -90,8 +94,9 @@ class MixedEffectsProblem:
         such as optical gains that depend on the mode; fitted after the model's own variants and ``extras``.
     extras
         Extra parameters, fitted after the model's own variants.
-    shape
-        Terms of the shape of this model's influence functions, if they exist already.
+    earlier
+        A problem with the same model that was solved before, of which terms of the shape are used, and the
+        derivatives at its solution if the matrix is the same, too.
     """
 
     def __init__(
@@ -101,7 +106,7 @@ class MixedEffectsProblem:
         priors: Priors,
         command_curves: Sequence[NDArray[np.float64]] = (),
         extras: Sequence[ExtraParameterModel] = (),
-        shape: InfluenceShape | None = None,
+        earlier: MixedEffectsProblem | None = None,
     ) -> None:
         self.weighted, self.command_curves, self.priors = weighted, tuple(command_curves), priors
         self.extras = tuple(extras)
@@ -112,7 +117,8 @@ class MixedEffectsProblem:
         # The x slopes of a column of sub-apertures share a sampling position, and the y slopes of a row.
         self.lines = np.unique(np.concatenate([cols, weighted.valid.shape[1] + rows]), return_inverse=True)[1]
         self.n_lines = int(self.lines.max()) + 1
-        self.shape = shape or InfluenceShape(model)
+        self.shape = earlier.shape if earlier else InfluenceShape(model)
+        self.kept = earlier.kept if earlier and earlier.weighted is weighted else None
         self.trends = slope_trends(model, weighted.valid)
         self.precision = np.concatenate([
             np.zeros(6), [priors.width**-2], (priors.shape_scale * self.shape.prior_sigma) ** -2.0,
@@ -171,30 +177,49 @@ class MixedEffectsProblem:
         )
 
     def _zonal_matrices(self, state: MixedEffectsState) -> _ZonalMatrices:
-        """The weighted zonal matrix of a state and its parts."""
-        registration, w, weigh = Registration.from_array(state.alpha), 1.0 + state.width, self.weighted.weigh
+        """The zonal matrix of a state and its parts."""
+        registration, w = Registration.from_array(state.alpha), 1.0 + state.width
         shaped = self.shape.linearise(registration, w, state.shape)
-        nominal, jacobian, total = weigh(shaped.nominal), weigh(shaped.jacobian), weigh(shaped.matrix)
-        variants = []
+        jacobian, variants = shaped.jacobian, []
         for variant, share in zip(self.variants, state.variant, strict=False):
             if abs(share) < _SMALL_SHARE:
-                variants.append(weigh(variant.zonal_matrix(registration, w)) - nominal)
+                variants.append(variant.zonal_matrix(registration, w) - shaped.nominal)
                 continue
             # A large share changes the derivatives by the registration.
-            changed, changes = (weigh(part) for part in zonal_jacobian(variant, registration, w))
-            variants.append(changed - nominal)
-            jacobian = jacobian + share * (changes - weigh(shaped.base))
-        by_width = jacobian[5] * w
+            changed, changes = zonal_jacobian(variant, registration, w)
+            variants.append(changed - shaped.nominal)
+            jacobian = jacobian + share * (changes - shaped.base)
         first = len(self.variants)
         for extra, share in zip(self.extras, state.variant[first:], strict=False):
-            variants.append(weigh(extra.matrix_change(registration, w, float(share))))
-        variants += [nominal @ command_curve for command_curve in self.command_curves]
-        for share, difference in zip(state.variant, variants, strict=True):
-            total = total + share * difference
+            variants.append(extra.matrix_change(registration, w, float(share)))
+        variants += [shaped.nominal @ command_curve for command_curve in self.command_curves]
+        z = _ZonalMatrices(jacobian, jacobian[5] * w, shaped.terms, variants, shaped.matrix)
+        z.total = self._add_effects(shaped.matrix, state, z)
+        return z
+
+    @staticmethod
+    def _add_effects(
+        shaped: NDArray[np.float64], state: MixedEffectsState, z: _ZonalMatrices
+    ) -> NDArray[np.float64]:
+        """The zonal matrix of a state from that of the common shape, with the derivatives of ``z``."""
         _, width, along_x, along_y = state.actuator
-        total = total + width * by_width + along_x * jacobian[0] + along_y * jacobian[1]
-        terms = [weigh(term) for term in shaped.terms]
-        return _ZonalMatrices(jacobian, by_width, terms, variants, total)
+        total = shaped + width * z.by_width
+        total += along_x * z.jacobian[0]
+        total += along_y * z.jacobian[1]
+        for share, difference in zip(state.variant, z.variants, strict=True):
+            total += share * difference
+        return total
+
+    def _sampled(
+        self, state: MixedEffectsState, total: NDArray[np.float64], z: _ZonalMatrices
+    ) -> NDArray[np.float64]:
+        """The zonal matrix with the sampling positions of a state.
+
+        A position acts as a shift shared by the lenslets of a column (x) or a row (y).
+        """
+        half = len(total) // 2
+        along_axes = np.concatenate([z.jacobian[0, :half], z.jacobian[1, half:]])
+        return np.asarray(total + state.sampling[self.lines, None] * along_axes)
 
     def matrix(self, state: MixedEffectsState, m2c: NDArray[np.float64]) -> NDArray[np.float64]:
         """Slopes per unit of modes ``m2c (n_act, n)`` at a state, random effects included."""
@@ -202,38 +227,52 @@ class MixedEffectsProblem:
 
     def linearise(self, state: MixedEffectsState) -> NormalEquations:
         """Model and derivatives about a state."""
+        if self.kept is not None and (system := self._update_kept(state, *self.kept)):
+            return system
         z = self._zonal_matrices(state)
-        rows, actuator_factor = self._slope_gains(state)[:, None], 1 + state.actuator_gain
+        actuator_factor = 1 + state.actuator_gain
+        # The weights of the slopes are applied together with their gains.
+        scale = (state.gain * self._slope_gains(state) / self.weighted.by_slope)[:, None]
+        parts = (z.total, *z.jacobian, *z.terms, *z.variants)
+        common = np.empty((len(parts), *self.weighted.data.shape))
         scaled_modes = actuator_factor[:, None] * self.modes
-
-        def modal(zonal: NDArray[np.float64]) -> NDArray[np.float64]:
-            return np.asarray(rows * (zonal @ scaled_modes))
-
-        unit = modal(z.total)
-        parts = (*z.jacobian, *z.terms, *z.variants)
-        common = np.stack([unit, *(state.gain * modal(part) for part in parts)])
-        # A sampling position acts as a shift shared by the lenslets of a column (x) or a row (y).
-        half = unit.shape[0] // 2
+        for part, derivative in zip(parts, common, strict=True):
+            np.matmul(part, scaled_modes, out=derivative)
+            derivative *= scale
+        half = len(scale) // 2
         sampling_derivative = np.concatenate([common[1, :half], common[2, half:]])
-        model = state.gain * unit + state.sampling[self.lines, None] * sampling_derivative
-        return normal_equations(
-            common, state.gain * rows * self._actuator_derivatives(z, actuator_factor), self.modes,
-            state.gain * (z.total @ scaled_modes), self.weighted.data - model, self.precision,
-            self.offset(state), sampling_derivative, self.lines, self.trends,
+        residual = self.weighted.data - common[0] - state.sampling[self.lines, None] * sampling_derivative
+        model = common[0] / self._slope_gains(state)[:, None]
+        common[0] /= state.gain
+        system = normal_equations(
+            common, self._actuator_derivatives(z, scale, actuator_factor), self.modes, model, residual,
+            self.precision, self.offset(state), sampling_derivative, self.lines, self.trends,
         )  # fmt: skip
+        self.kept = z, system
+        return system
 
+    def _update_kept(
+        self, state: MixedEffectsState, z: _ZonalMatrices, system: NormalEquations
+    ) -> NormalEquations | None:
+        """The system of a state with derivatives from near it; ``None`` if it is too far."""
+        registration, w = Registration.from_array(state.alpha), 1.0 + state.width
+        total = self._add_effects(self.shape.matrix(registration, w, state.shape, z.terms), state, z)
+        scale = (state.gain * self._slope_gains(state) / self.weighted.by_slope)[:, None]
+        model = scale * (self._sampled(state, total, z) @ ((1 + state.actuator_gain)[:, None] * self.modes))
+        before = self.weighted.data - system.residual
+        if np.linalg.norm(model - before) > _KEEP_BELOW * np.linalg.norm(before):
+            return None
+        return system.update(self.weighted.data - model, self.precision, self.offset(state))
+
+    @staticmethod
     def _actuator_derivatives(
-        self, z: _ZonalMatrices, actuator_factor: NDArray[np.float64]
+        z: _ZonalMatrices, scale: NDArray[np.float64], actuator_factor: NDArray[np.float64]
     ) -> NDArray[np.float64]:
         """Weighted derivatives by the effects of the actuators ``(n_effects, n_slopes, n_act)``."""
-        return np.stack(
-            [
-                z.total,
-                z.by_width * actuator_factor,
-                z.jacobian[0] * actuator_factor,
-                z.jacobian[1] * actuator_factor,
-            ]
-        )
+        derivatives = np.stack([z.total, z.by_width, z.jacobian[0], z.jacobian[1]])
+        derivatives *= scale
+        derivatives[1:] *= actuator_factor
+        return derivatives
 
     def _slope_gains(self, state: MixedEffectsState) -> NDArray[np.float64]:
         """Gain of every slope relative to the common one ``(n_slopes,)``."""
@@ -242,11 +281,8 @@ class MixedEffectsProblem:
     def zonal_matrix(self, state: MixedEffectsState) -> NDArray[np.float64]:
         """Slopes per unit command ``(n_slopes, n_act)`` at a state, random effects included."""
         z = self._zonal_matrices(state)
-        half = len(z.total) // 2
-        sampling_derivative = np.concatenate([z.jacobian[0, :half], z.jacobian[1, half:]])
-        sampled_matrix = z.total + state.sampling[self.lines, None] * sampling_derivative
-        scale = state.gain * self._slope_gains(state) * self.weighted.by_slope
-        return np.asarray(scale[:, None] * sampled_matrix * (1 + state.actuator_gain))
+        scale = state.gain * self._slope_gains(state)
+        return np.asarray(scale[:, None] * self._sampled(state, z.total, z) * (1 + state.actuator_gain))
 
     def estimate_priors(self, state: MixedEffectsState, system: NormalEquations) -> PriorEstimate:
         """Estimate the scatter of the random effects from a solution (:func:`estimate_scatters`)."""
@@ -385,10 +421,13 @@ def estimate_scatters(
     right_hand_side = unit * (information @ value) / noise**2
     prior, ratios = (precision > 0).astype(float), np.ones(len(groups))
     for _ in range(_ITERATIONS):
-        covariance = np.linalg.inv(data + np.diag(prior))
-        posterior_mean, before = covariance @ right_hand_side, ratios.copy()
+        factor, failed = dpotrf(data + np.diag(prior))
+        if failed:  # no information on some unknown
+            break
+        posterior_mean, before = dpotrs(factor, right_hand_side)[0], ratios.copy()
+        variance = np.diag(dpotri(factor, overwrite_c=True)[0])
         for number, (group, (smallest, largest)) in enumerate(zip(groups, bounds, strict=True)):
-            n_determined = float(np.sum(1 - np.diag(covariance)[group] * prior[group]))
+            n_determined = float(np.sum(1 - variance[group] * prior[group]))
             square = np.square(posterior_mean[group]).sum() / (n_determined + _PSEUDO_COUNT)
             ratios[number] = np.clip(np.sqrt(square), smallest, largest)
             prior[group] = ratios[number] ** -2

@@ -7,10 +7,15 @@ data decide its size and the errors of the registration include it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import lu_factor, lu_solve
+
+#: Slopes whose products with all common parameters are in memory at once.
+_SLOPES_AT_ONCE = 256
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +85,7 @@ class NormalEquations:
         ``inner`` with the slope gains eliminated.
     right_hand_side
         Of the whole system.
-    common, sampling_derivative, actuator_derivatives, modes, model, residual, lines, trends
+    common, sampling_derivative, actuator_derivatives, modes, model, residual, lines, trends, precision
         Arguments of :func:`normal_equations`.
     """
 
@@ -97,6 +102,8 @@ class NormalEquations:
     residual: NDArray[np.float64]
     lines: NDArray[np.intp]
     trends: NDArray[np.float64]
+    precision: NDArray[np.float64]
+    _elimination: tuple[Any, NDArray[np.float64]] | None = None
 
     @property
     def n_common(self) -> int:
@@ -108,20 +115,61 @@ class NormalEquations:
         """The full normal matrix."""
         return np.block([[self.inner, self.coupling.T], [self.coupling, np.diag(self.diagonal)]])
 
+    def update(
+        self, residual: NDArray[np.float64], precision: NDArray[np.float64], offset: NDArray[np.float64]
+    ) -> NormalEquations:
+        """The same derivatives with another residual and other priors, as for :func:`normal_equations`."""
+        n, changes = len(self.inner), precision - self.precision
+        system = self
+        if changes.any():
+            inner, diagonal = self.inner.copy(), self.diagonal + changes[n:]
+            inner[np.diag_indices(n)] += changes[:n]
+            schur_complement = _eliminate_slope_gains(inner, self.coupling, diagonal)
+            system = replace(
+                self, inner=inner, diagonal=diagonal, schur_complement=schur_complement, precision=precision,
+                _elimination=None,
+            )  # fmt: skip
+        return replace(system, residual=residual, right_hand_side=self._scores(residual) - precision * offset)
+
+    def _scores(self, residual: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Products of all derivatives with a residual, in the order of the unknowns."""
+        score = np.einsum("sm,sm->s", self.model, residual)
+        by_slope = np.einsum("sm,sm->s", self.sampling_derivative, residual)
+        by_actuator = np.einsum("zsa,sa->za", self.actuator_derivatives, residual @ self.modes.T)
+        return np.concatenate([
+            self.common.reshape(self.n_common, -1) @ residual.ravel(),
+            np.bincount(self.lines, by_slope, self.n_lines)[: self.n_lines],
+            score @ self.trends, by_actuator.ravel(), score,
+        ])  # fmt: skip
+
+    @property
+    def n_lines(self) -> int:
+        """Number of sampling positions."""
+        n_kinds, _, n_act = self.actuator_derivatives.shape
+        return len(self.inner) - self.n_common - self.trends.shape[1] - n_kinds * n_act
+
+    def _eliminate_effects(self) -> tuple[Any, NDArray[np.float64]]:
+        """LU factors of the block of the effects, and its solution for their coupling with the common."""
+        if self._elimination is None:
+            k = self.n_common
+            factors = lu_factor(self.schur_complement[k:, k:])
+            self._elimination = factors, lu_solve(factors, self.schur_complement[k:, :k])
+        return self._elimination
+
     def solve(self) -> NDArray[np.float64]:
         """The Gauss-Newton step, in the order of the unknowns."""
-        n = len(self.inner)
+        k, n = self.n_common, len(self.inner)
         scaled = self.right_hand_side[n:] / self.diagonal
-        first = np.linalg.solve(self.schur_complement, self.right_hand_side[:n] - self.coupling.T @ scaled)
+        right = self.right_hand_side[:n] - self.coupling.T @ scaled
+        factors, by_common = self._eliminate_effects()
+        common = np.linalg.solve(self.information(), right[:k] - right[k:] @ by_common)
+        first = np.concatenate([common, lu_solve(factors, right[k:]) - by_common @ common])
         return np.concatenate([first, scaled - self.coupling @ first / self.diagonal])
 
     def information(self) -> NDArray[np.float64]:
         """Information on the common parameters ``(n_common, n_common)``, random effects integrated out."""
         k, schur_complement = self.n_common, self.schur_complement
-        return np.asarray(
-            schur_complement[:k, :k]
-            - schur_complement[:k, k:] @ np.linalg.solve(schur_complement[k:, k:], schur_complement[k:, :k])
-        )
+        return np.asarray(schur_complement[:k, :k] - schur_complement[:k, k:] @ self._eliminate_effects()[1])
 
     def noise_covariance(self, precision: NDArray[np.float64]) -> NDArray[np.float64]:
         """Covariance of the common parameters due to the noise alone ``(n_common, n_common)``.
@@ -156,22 +204,22 @@ class NormalEquations:
         -------
         ndarray, ``(n_common, n_slopes, n_modes)``
         """
-        k, n_trends = self.n_common, self.trends.shape[1]
-        n_kinds, _, n_act = self.actuator_derivatives.shape
-        schur_complement = self.schur_complement
-        inner = np.linalg.solve(schur_complement[k:, k:], schur_complement[k:, :k])
-        by_slope = (self.coupling[:, :k] - self.coupling[:, k:] @ inner) / self.diagonal[:, None]
-        n_lines = len(inner) - n_trends - n_kinds * n_act
-        ends = np.cumsum([n_lines, n_trends])
+        k, n_lines = self.n_common, self.n_lines
+        n_kinds, n_slopes, n_act = self.actuator_derivatives.shape
+        effects = self._eliminate_effects()[1]
+        by_slope = (self.coupling[:, :k] - self.coupling[:, k:] @ effects) / self.diagonal[:, None]
+        by_line, by_trend, by_actuator = np.split(effects, np.cumsum([n_lines, self.trends.shape[1]]))
+        weights = by_actuator.reshape(n_kinds, n_act, k).transpose(2, 0, 1)
+        by_model = by_slope + self.trends @ by_trend
         out = np.empty_like(self.common)
+        acting = np.empty((n_slopes, n_act))
         for p in range(k):
-            by_line, by_trend, by_actuator = np.split(inner[:, p], ends)
-            acting = (self.actuator_derivatives * by_actuator.reshape(n_kinds, 1, n_act)).sum(
-                axis=0
-            ) @ self.modes
-            out[p] = self.common[p] - acting - (by_slope[:, p] + self.trends @ by_trend)[:, None] * self.model
+            np.einsum("zsa,za->sa", self.actuator_derivatives, weights[p], out=acting)
+            np.matmul(acting, self.modes, out=out[p])
+            np.subtract(self.common[p], out[p], out=out[p])
+            out[p] -= by_model[:, p, None] * self.model
             if n_lines:
-                out[p] -= by_line[self.lines, None] * self.sampling_derivative
+                out[p] -= by_line[self.lines, p, None] * self.sampling_derivative
         return out
 
     def estimate_noise_inflation(self) -> float:
@@ -228,28 +276,23 @@ def normal_equations(
         member = np.zeros((len(model), 0))
     else:
         member = (lines[:, None] == np.arange(lines.max() + 1)).astype(float)
-    k, n_modes = common.shape[0], model.shape[1]
-    flat, zonal = common.reshape(k, -1), actuator_derivatives
-    overlap = modes @ modes.T
-    acting = np.block([[(a.T @ b) * overlap for b in zonal] for a in zonal])
-    onto_modes = (common.reshape(-1, n_modes) @ modes.T).reshape(k, len(model), -1)
-    common_acting = np.concatenate([(onto_modes * z).sum(axis=1) for z in zonal], axis=1)
+    k, n_kinds = len(common), len(actuator_derivatives)
+    # All kinds side by side, so that products are few and large.
+    zonal = np.concatenate(list(actuator_derivatives), axis=1)
+    acting = (zonal.T @ zonal) * np.tile(modes @ modes.T, (n_kinds, n_kinds))
     common_line = np.einsum("psm,sm->ps", common, sampling_derivative) @ member
-    sampled_modes = sampling_derivative @ modes.T
-    line_acting = member.T @ np.concatenate([sampled_modes * z for z in zonal], axis=1)
-    line = np.diag(np.square(sampling_derivative).sum(axis=1) @ member)
-    model_modes, residual_modes = model @ modes.T, residual @ modes.T
-    by_common = np.einsum("sm,psm->sp", model, common)
-    by_line = member * (model * sampling_derivative).sum(axis=1)[:, None]
-    by_acting = np.concatenate([model_modes * z for z in zonal], axis=1)
-    power, score = np.square(model).sum(axis=1), np.einsum("sm,sm->s", model, residual)
+    line_acting = member.T @ (np.tile(sampling_derivative @ modes.T, n_kinds) * zonal)
+    line = np.diag(np.einsum("sm,sm->s", sampling_derivative, sampling_derivative) @ member)
+    by_line = member * np.einsum("sm,sm->s", model, sampling_derivative)[:, None]
+    by_acting = np.tile(model @ modes.T, n_kinds) * zonal
+    power = np.einsum("sm,sm->s", model, model)
     # A trend is a linear combination of slope gains, so its products follow from theirs.
     by_trend = trends * power[:, None]
-    coupling = np.concatenate([by_common, by_line, by_trend, by_acting], axis=1)
-    trend = trends.T @ coupling
+    coupling = np.concatenate([np.einsum("sm,psm->sp", model, common), by_line, by_trend, by_acting], axis=1)
     common_trend, line_trend, trend_trend, trend_acting = np.split(
-        trend, np.cumsum([k, member.shape[1], trends.shape[1]]), axis=1
+        trends.T @ coupling, np.cumsum([k, member.shape[1], trends.shape[1]]), axis=1
     )
+    flat, common_acting = common.reshape(k, -1), _common_products(common, actuator_derivatives, modes)
     inner = np.block(
         [
             [flat @ flat.T, common_line, common_trend.T, common_acting],
@@ -258,20 +301,33 @@ def normal_equations(
             [common_acting.T, line_acting.T, trend_acting.T, acting],
         ]
     )
-    right_hand_side = np.concatenate(
-        [
-            flat @ residual.ravel(),
-            (residual * sampling_derivative).sum(axis=1) @ member,
-            score @ trends,
-            *(np.einsum("sa,sa->a", z, residual_modes) for z in zonal),
-            score,
-        ]
-    )
     n = len(inner)
     inner[np.diag_indices(n)] += precision[:n]
     diagonal = power + precision[n:]
-    schur_complement = inner - coupling.T @ (coupling / diagonal[:, None])
-    return NormalEquations(
-        inner, coupling, diagonal, schur_complement, right_hand_side - precision * offset,
-        common, sampling_derivative, actuator_derivatives, modes, model, residual, lines, trends,
+    system = NormalEquations(
+        inner, coupling, diagonal, _eliminate_slope_gains(inner, coupling, diagonal), np.zeros(0),
+        common, sampling_derivative, actuator_derivatives, modes, model, residual, lines, trends, precision,
     )  # fmt: skip
+    return system.update(residual, precision, offset)
+
+
+def _common_products(
+    common: NDArray[np.float64], actuator_derivatives: NDArray[np.float64], modes: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Products of the derivatives by common parameters and by effects ``(n_common, n_kinds * n_act)``."""
+    k, n_slopes, n_modes = common.shape
+    n_act = len(modes)
+    total = np.zeros((n_act, k, len(actuator_derivatives)))
+    for first in range(0, n_slopes, _SLOPES_AT_ONCE):
+        part = slice(first, first + _SLOPES_AT_ONCE)
+        onto_modes = (modes @ common[:, part].reshape(-1, n_modes).T).reshape(n_act, k, -1)
+        total += onto_modes @ np.ascontiguousarray(actuator_derivatives[:, part].transpose(2, 1, 0))
+    return total.transpose(1, 2, 0).reshape(k, -1)
+
+
+def _eliminate_slope_gains(
+    inner: NDArray[np.float64], coupling: NDArray[np.float64], diagonal: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Schur complement of the block of the slope gains."""
+    scaled = coupling / np.sqrt(diagonal)[:, None]
+    return np.asarray(inner - scaled.T @ scaled)

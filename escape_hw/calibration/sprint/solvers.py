@@ -21,7 +21,6 @@ from escape_hw.api.synthetic_model import HasSlopeWeights, SyntheticModel
 from escape_hw.calibration.sprint.coarse_search import low_mode_problem, search_registration
 from escape_hw.calibration.sprint.covariance import LinearisedProblem
 from escape_hw.calibration.sprint.extra_parameters import ExtraParameterModel, FittedExtraParameter
-from escape_hw.calibration.sprint.influence_shape import InfluenceShape
 from escape_hw.calibration.sprint.least_squares import (
     NEGLIGIBLE_STEP,
     BatchProblem,
@@ -63,10 +62,9 @@ class SolverContext:
     extras: tuple[ExtraParameterModel, ...] = ()
     history: list[SprintIteration] = field(default_factory=list)
     report: Reporter = field(init=False)
-    shape: InfluenceShape = field(init=False)
+    problem: MixedEffectsProblem | None = field(init=False, default=None)
 
     def __post_init__(self) -> None:
-        self.shape = InfluenceShape(self.model)
         self.report = Reporter("SPRINT", self.max_iterations, "iteration")
 
     def progress(self, sigma: NDArray[np.float64] | None = None) -> Progress:
@@ -152,8 +150,8 @@ def solve(
         fit = yield from _record_steps(search, context)
         start = fit.alpha
     if solver == "mixed-effects":
-        problem = MixedEffectsProblem(
-            weighted, model, context.priors, extras=context.extras, shape=context.shape
+        problem = context.problem = MixedEffectsProblem(
+            weighted, model, context.priors, extras=context.extras, earlier=context.problem
         )
         state = state or problem.initial_state(Registration.from_array(start))
         return (yield from _fit_mixed_effects(problem, state, context))

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.registration import Registration
 from escape_hw.api.synthetic_model import SyntheticModel
-from escape_hw.calibration.modes.derivatives import modal_jacobian, modal_matrix, zonal_jacobian
+from escape_hw.calibration.modes.derivatives import modal_jacobian, modal_matrix, zonal_jacobian, zonal_sum
 
 #: Mean slope of a column relative to its rms below which its tip and tilt count as removed: rounding in
 #: single precision leaves 1e-6, a measured column about its noise over the root of the number of slopes.
@@ -50,6 +50,12 @@ class TipTiltFreeModel:
     def zonal_matrix(self, registration: Registration, width: float = 1.0) -> NDArray[np.float64]:
         """Slopes per unit command ``(n_slopes, n_act)``."""
         return remove_tip_tilt(self._model.zonal_matrix(registration, width))
+
+    def zonal_sum(
+        self, functions: Sequence[tuple[NDArray[np.float64] | float, Registration, float]]
+    ) -> NDArray[np.float64]:
+        """Slopes of a sum of influence functions per unit command ``(n_slopes, n_act)``."""
+        return remove_tip_tilt(zonal_sum(self._model, functions))
 
     def zonal_jacobian(
         self, registration: Registration, width: float = 1.0

@@ -55,11 +55,13 @@ def gaussian_factors(
     x_m: NDArray[np.float64],
     y_m: NDArray[np.float64],
     dtype: DTypeLike = np.float32,
+    *,
+    derivatives: bool = True,
 ) -> GaussianFactors:
     """Factors of influence functions of equal width and gain, and of their derivatives.
 
     The grid is given as for :meth:`InfluenceFunctions.factors`. Gain and shares are contained in the factors
-    along y. Single precision gives 1e-6 of a surface.
+    along y. Single precision gives 1e-6 of a surface. Without ``derivatives`` only ``X_0`` is computed.
 
     Raises
     ------
@@ -87,7 +89,8 @@ def gaussian_factors(
     ):
         u = (coordinates[:, None] - position) / s
         gauss = np.exp(-0.5 * np.square(u))
-        factors_xy.append(np.stack([gauss, gauss * u / s, gauss * np.square(u)]))
+        kinds = [gauss, gauss * u / s, gauss * np.square(u)] if derivatives else [gauss]
+        factors_xy.append(np.stack(kinds))
     factors_xy[1] *= float(influence.gain) * shares
     position, log_width = _parameter_derivatives(influence, registration, sub_aperture_m, stretch)
     return GaussianFactors(

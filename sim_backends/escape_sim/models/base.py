@@ -66,6 +66,10 @@ class DesignModel:
         registration: Registration,
         width: float,
         dtype: DTypeLike = np.float32,
+        *,
+        derivatives: bool = False,
     ) -> GaussianFactors:
         influence = replace(self._nominal, width=width)
-        return gaussian_factors(influence, registration, self.sub_aperture_m, at_m, at_m, dtype)
+        return gaussian_factors(
+            influence, registration, self.sub_aperture_m, at_m, at_m, dtype, derivatives=derivatives
+        )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -174,6 +175,16 @@ class PyramidModel(DesignModel):
         factors = self._factors(self._nodes, registration, width)
         return self._slopes(_zonal_surfaces(factors, 0, 0))
 
+    def zonal_sum(
+        self, functions: Sequence[tuple[NDArray[np.float64] | float, Registration, float]]
+    ) -> NDArray[np.float64]:
+        """Slopes of a sum of influence functions ``(n_slopes, n_act)``, see :class:`SummingModel`."""
+        surfaces = np.zeros((self._nodes.size, self._nodes.size, self.n_act), np.float32)
+        for factor, registration, width in functions:
+            factors = self._factors(self._nodes, registration, width)
+            surfaces += _zonal_surfaces(factors, 0, 0) * np.asarray(factor, np.float32)
+        return self._slopes(surfaces)
+
     def modal_matrix(
         self, registration: Registration, m2c: NDArray[np.float64], width: float = 1.0
     ) -> NDArray[np.float64]:
@@ -184,7 +195,8 @@ class PyramidModel(DesignModel):
         self, registration: Registration, m2c: NDArray[np.float64], width: float = 1.0
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Modal matrix and its derivatives, see :class:`DifferentiableModel`."""
-        surfaces = mode_derivatives(self._factors(self._nodes, registration, width), m2c)
+        factors = self._factors(self._nodes, registration, width, derivatives=True)
+        surfaces = mode_derivatives(factors, m2c)
         parts = self._slopes(surfaces.reshape(*surfaces.shape[:2], -1))
         parts = parts.reshape(-1, 1 + N_DERIVATIVES, m2c.shape[1]).transpose(1, 0, 2)
         return parts[0], parts[1:]
@@ -193,7 +205,7 @@ class PyramidModel(DesignModel):
         self, registration: Registration, width: float = 1.0
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Zonal matrix and its derivatives, see :class:`DifferentiableModel`."""
-        factors = self._factors(self._nodes, registration, width)
+        factors = self._factors(self._nodes, registration, width, derivatives=True)
         pairs = ((0, 0), (1, 0), (0, 1), (2, 0), (0, 2))
         parts = [self._slopes(_zonal_surfaces(factors, i, j)) for i, j in pairs]
         # By the positions along x and y, and by the logarithms of the widths along x and y.

@@ -6,6 +6,7 @@ mirror surfaces.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -412,11 +413,21 @@ class ShackHartmannModel(DesignModel):
         factors = self._factors(self._slopes.nodes_m, registration, width, np.float64)
         return np.asarray(factors.sum_terms(self._slopes.zonal(factors)[0]) * self._opd_per_command_m)
 
+    def zonal_sum(
+        self, functions: Sequence[tuple[NDArray[np.float64] | float, Registration, float]]
+    ) -> NDArray[np.float64]:
+        """Slopes of a sum of functions ``(n_slopes, n_act)``, see :class:`SummingModel`; single precision."""
+        total = np.zeros((2 * self._grid.n_valid, self.n_act))
+        for factor, registration, width in functions:
+            factors = self._factors(self._slopes.nodes_m, registration, width)
+            total += factor * factors.sum_terms(self._slopes.zonal(factors)[0])
+        return total * self._opd_per_command_m
+
     def zonal_jacobian(
         self, registration: Registration, width: float = 1.0
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Zonal matrix and its derivatives, see :class:`DifferentiableModel`; single precision."""
-        factors = self._factors(self._slopes.nodes_m, registration, width)
+        factors = self._factors(self._slopes.nodes_m, registration, width, derivatives=True)
         parts = factors.sum_terms(self._slopes.zonal(factors, derivatives=True))
         parts *= np.float32(self._opd_per_command_m)
         out = np.empty((N_DERIVATIVES, *parts.shape[1:]))
@@ -445,7 +456,7 @@ class ShackHartmannModel(DesignModel):
         self, registration: Registration, m2c: NDArray[np.float64], width: float = 1.0
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Modal matrix and its derivatives, see :class:`DifferentiableModel`; single precision."""
-        factors = self._factors(self._slopes.nodes_m, registration, width)
+        factors = self._factors(self._slopes.nodes_m, registration, width, derivatives=True)
         parts = factors.sum_terms(self._slopes.zonal(factors, derivatives=True))
         modes = (m2c * self._opd_per_command_m).astype(np.float32)
         out = np.zeros((N_DERIVATIVES, parts.shape[1], m2c.shape[1]))
