@@ -82,11 +82,11 @@ PROFILE_WIDTHS = (1.0, 0.35, 0.6, 1.7, 2.9)
 
 @runtime_checkable
 class HasProfile(Protocol):
-    """A model whose nominal influence function is a sum of one function at several widths."""
+    """A model whose nominal influence function is a sum of one function at several widths, or any other."""
 
     @property
     def profile_shares(self) -> tuple[float, ...]:
-        """Share of the function at each of :data:`PROFILE_WIDTHS`."""
+        """Share of the function at each of :data:`PROFILE_WIDTHS`; empty for any other shape."""
 
     def component_model(self) -> SyntheticModel:
         """The same model with the function alone as the nominal influence function."""
