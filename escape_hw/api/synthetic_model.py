@@ -93,6 +93,26 @@ class HasProfile(Protocol):
 
 
 @runtime_checkable
+class HasSurfaces(Protocol):
+    """A model that gives the surfaces of its influence functions."""
+
+    def surface_model(self, x_m: NDArray[np.float64], y_m: NDArray[np.float64]) -> SyntheticModel:
+        """The same mirror on a sensor of heights instead of slopes.
+
+        Parameters
+        ----------
+        x_m, y_m
+            Coordinates ``(n_x,)`` and ``(n_y,)`` of a grid on the pupil in metres.
+
+        Returns
+        -------
+        SyntheticModel
+            Its zonal matrix has the heights of the grid points, row by row, per unit command ``(n_y * n_x,
+            n_act)`` in fractions of full stroke.
+        """
+
+
+@runtime_checkable
 class HasSystematicError(Protocol):
     """A model with a systematic error of the origin of its registration."""
 

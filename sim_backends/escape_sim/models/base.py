@@ -60,6 +60,12 @@ class DesignModel:
         """Size of a sub-aperture, or of a pixel of the pupil image, on the pupil in metres."""
         return self._pupil.sub_aperture_m
 
+    def surface_model(self, x_m: NDArray[np.float64], y_m: NDArray[np.float64]) -> SurfaceModel:
+        """The same mirror on a sensor of heights, see :class:`HasSurfaces`."""
+        model = SurfaceModel(self._config, self._pupil, x_m, y_m)
+        model._nominal = self._nominal  # noqa: SLF001
+        return model
+
     @property
     def registration_systematic_error(self) -> NDArray[np.float64]:
         """Error of the place of measured influence functions, see :class:`HasSystematicError`."""
@@ -116,3 +122,33 @@ class DesignModel:
             parts.append(slopes(columns).reshape(-1, len(block), block.shape[3]).transpose(1, 0, 2))
         joined = np.concatenate(parts, axis=2).astype(float)
         return joined[0], joined[1:]
+
+
+class SurfaceModel(DesignModel):
+    """The design's mirror on a sensor of heights: its slopes are those of the grid points, row by row."""
+
+    name = "surface"
+
+    def __init__(
+        self,
+        config: SystemConfig,
+        pupil: PupilGeometry,
+        x_m: NDArray[np.float64],
+        y_m: NDArray[np.float64],
+    ) -> None:
+        super().__init__(config, pupil)
+        self._x_m, self._y_m = x_m, y_m
+
+    def influence_functions(self) -> tuple[NDArray[np.float64], NDArray[np.bool_], float]:
+        """Nominal influence functions over the pupil, see :class:`SyntheticModel`."""
+        return self._surfaces(self._pupil.coordinates_m), self._pupil.lit, self._pupil.pixel_m
+
+    def zonal_matrix(self, registration: Registration, width: float = 1.0) -> NDArray[np.float64]:
+        """Heights per unit command ``(n_y * n_x, n_act)`` in fractions of full stroke."""
+        influence = self._nominal.with_width(width)
+        surfaces = influence.surfaces(registration, self.sub_aperture_m, self._x_m, self._y_m)
+        return surfaces.reshape(len(surfaces), -1).T
+
+    def variants(self) -> list[Self]:
+        """No variants: heights do not depend on the sensor."""
+        return []
