@@ -9,6 +9,9 @@ from numpy.typing import NDArray
 
 from escape_hw.api.representation import short_repr
 
+#: FITS cards of the errors of the place: shifts in metres, rotation in degrees, scalings in %.
+PLACE_CARDS = ("ERR_SHX", "ERR_SHY", "ERR_ROT", "ERR_RAD", "ERR_TAN")
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class InfluenceProfile:
@@ -55,6 +58,9 @@ class InfluenceEstimate:
         True for edge actuators, which have a shape of their own ``(n_act,)``.
     profile
         Radial profile.
+    place_sigma
+        Standard errors of the place on the mirror ``(5,)``: shifts in metres on the pupil, rotation in
+        degrees, scalings in %. They are those of the registration, from which the shape is not independent.
     """
 
     surfaces: NDArray[np.float64]
@@ -68,4 +74,5 @@ class InfluenceEstimate:
     gain_sigma: NDArray[np.float64]
     edge: NDArray[np.bool_]
     profile: InfluenceProfile
+    place_sigma: NDArray[np.float64]
     __repr__ = short_repr

@@ -116,7 +116,7 @@ class RegistrationEstimate:
     extras
         Estimates of the extra parameters by name.
     influence_profile
-        Fitted profile of the influence functions; ``None`` if it was not fitted, or the model has no surfaces.
+        Fitted profile of the influence functions; ``None`` if it was not fitted.
     """
 
     registration: Registration

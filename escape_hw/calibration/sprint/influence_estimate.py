@@ -1,7 +1,7 @@
 """Influence functions that SPRINT has found, as surfaces: profile with errors, and maps of all actuators.
 
-The terms of the common shape are sums of nominal influence functions. A model that gives heights instead of
-slopes (:class:`~escape_hw.api.synthetic_model.HasSurfaces`) therefore turns fitted coefficients into surfaces.
+The terms of the common shape are sums of nominal influence functions. A model that gives heights instead
+of slopes (:class:`~escape_hw.api.synthetic_model.HasSurfaces`) turns fitted coefficients into surfaces.
 """
 
 from __future__ import annotations
@@ -123,6 +123,7 @@ def estimate_influence_functions(model: SyntheticModel, estimate: RegistrationEs
         heights, np.sqrt(np.maximum(variance, 0.0)), x, y, pitch,
         nominal + percent * corrections.position.T, percent * corrections.position_sigma.T,
         corrections.gain, corrections.gain_sigma, find_edge_actuators(nominal), profile,
+        estimate.sigma * [percent, percent, 1.0, 1.0, 1.0],
     )  # fmt: skip
 
 

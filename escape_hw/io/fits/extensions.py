@@ -227,7 +227,9 @@ def _pack_actuators(corrections: ActuatorCorrections) -> list[Any]:
         fits_file.table_extension("SHAPE", {"VALUE": corrections.shape}),
     ]
     if corrections.shape_covariance is not None:
-        hdus.append(fits_file.image_extension("SHAPECOV", np.asarray(corrections.shape_covariance, np.float64)))
+        hdus.append(
+            fits_file.image_extension("SHAPECOV", np.asarray(corrections.shape_covariance, np.float64))
+        )
     return hdus
 
 

@@ -16,6 +16,7 @@ from scipy import ndimage
 from scipy.sparse import diags, identity, kron, vstack
 from scipy.sparse.linalg import splu
 
+from escape_hw.api.influence import PLACE_CARDS
 from escape_hw.bounded_files import MAX_ARRAY_BYTES, read_bounded
 from escape_hw.calibration.sprint.influence_shape import find_edge_actuators
 from escape_hw.errors import ConfigError, ProductError
@@ -235,8 +236,14 @@ def _header_coordinates(content: _File, pitch_m: float) -> InfluenceMaps | None:
     centre = np.array([float(header[f"CRPIX{axis}"]) - 1 for axis in (1, 2)]) - value / step
     return InfluenceMaps(
         content.cube, float(abs(step[0])) / pitch_m, np.zeros((len(content.cube), 2)),
-        (float(centre[0]), float(centre[1])), np.diag(np.sign(step)),
+        (float(centre[0]), float(centre[1])), np.diag(np.sign(step)), _header_sigma(header, pitch_m),
     )  # fmt: skip
+
+
+def _header_sigma(header: dict[str, Any], pitch_m: float) -> tuple[float, float, float, float, float]:
+    """Errors of the place that SPRINT states for functions that it has found; 0 for others."""
+    x, y, *others = (float(header.get(card, 0.0)) for card in PLACE_CARDS)
+    return x / pitch_m, y / pitch_m, others[0], others[1], others[2]
 
 
 def _fit_place(
