@@ -216,7 +216,7 @@ class MirrorConfig(DeviceConfig):
         0.6, ge=0, le=5, description="width of a thin plate beyond its outermost actuators, pitches"
     )
     influence_file: str = Field(
-        "", description="influence = 'file': FITS or .npy file with a map per actuator (n_act, n_y, n_x)"
+        "", description="FITS or .npy file with a map per actuator (n_act, n_y, n_x), for the shape file"
     )
     influence_pixel_m: float | None = Field(
         None,

@@ -137,7 +137,7 @@ def _surfaces(
     unit = shaped.matrix + corrections.width * by_width
     unit += along_x * shaped.jacobian[0] + along_y * shaped.jacobian[1]
     common = np.stack([shaped.jacobian[5], *shaped.terms])
-    covariance = corrections.shape_covariance
+    covariance = np.asarray(corrections.shape_covariance)
     variance = np.einsum("psa,pq,qsa->sa", common, covariance, common, optimize=True)
     variance += np.square(by_width * corrections.width_sigma)
     for axis in (0, 1):

@@ -10,6 +10,7 @@ asymmetry of their own. All terms are linear in the slopes.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -122,7 +123,8 @@ class InfluenceShape:
         """
         single, by_single = zonal_jacobian(self._model, registration, width)
         if self._given is not None:
-            nominal, base = zonal_jacobian(self._given, registration, width)
+            given: Any = zonal_jacobian(self._given, registration, width)
+            nominal, base = given
         else:
             nominal, base = self._shares[0] * single, self._shares[0] * by_single
         jacobian, profile, outward = 0.0, [], [self._outward_derivative(by_single)]
