@@ -53,6 +53,9 @@ _GAIN_TREND = 0.3
 #: by ``_MIN_SLOPE_WEIGHT`` unless they are the majority.
 _MIN_RELATIVE_FLUX = 0.85
 _MIN_SLOPE_WEIGHT = 1e-3
+#: Detail of influence functions on a grid, relative to Gaussians. At equal nodes the matrix of a thin plate is
+#: wrong by 0.5 %, its derivatives by 4 %.
+_SHARPER = 0.5
 #: Mirror shapes whose response is computed for each turbulence state.
 _N_SHAPES = 10
 #: Relative uncertainty of the turbulence strength, and ellipticity of the modulation.
@@ -131,6 +134,8 @@ class PyramidModel(DesignModel):
             turbulence = estimate_strength(self.optics(), pupils, _OUTER_SCALE, self._pokes)
         self.turbulence = turbulence if turbulence >= _NEGLIGIBLE_STRENGTH else 0.0
         sigma = self._gaussian.pitch_m / np.sqrt(2 * np.log(1 / self._gaussian.coupling))
+        if not isinstance(self._nominal, InfluenceFunctions):
+            sigma *= _SHARPER
         self._nodes, self._interpolation = surface_nodes(pupil.coordinates_m, sigma)
         self._response = self._compute_phase_derivatives()
         self._response *= np.float32(scale)
