@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from escape_hw import errors, testing
     from escape_hw.api.adaptive_secondary import AdaptiveSecondary, ShellHealth, ShellState
     from escape_hw.api.camera import Camera, CameraInfo, CameraSettings, Frame, Region
+    from escape_hw.api.influence import InfluenceEstimate, InfluenceProfile
     from escape_hw.api.interaction_matrix import InteractionMatrix
     from escape_hw.api.mirror import DeformableMirror, DMInfo, SendReport
     from escape_hw.api.modulator import Modulation, ModulatorInfo, ModulatorStatus, TipTiltModulator
@@ -44,9 +45,11 @@ if TYPE_CHECKING:
     from escape_hw.calibration.loop.performance import close_loop
     from escape_hw.calibration.push_pull.procedure import push_pull
     from escape_hw.calibration.sprint.fit import sprint
+    from escape_hw.calibration.sprint.influence_estimate import estimate_influence_functions
     from escape_hw.config.bundled import bundled_systems
     from escape_hw.config.loader import load_system
     from escape_hw.config.registry import DeviceContext, register_device
+    from escape_hw.io.fits.influence import load_influence, save_influence
     from escape_hw.io.fits.matrix import load_matrix, save_matrix
     from escape_hw.remote.client import Connection, connect
     from escape_hw.runtime.session.system import System, open_system
@@ -57,6 +60,7 @@ if TYPE_CHECKING:
 _NAMES = {
     "escape_hw.api.adaptive_secondary": "AdaptiveSecondary ShellHealth ShellState",
     "escape_hw.api.camera": "Camera CameraInfo CameraSettings Frame Region",
+    "escape_hw.api.influence": "InfluenceEstimate InfluenceProfile",
     "escape_hw.api.interaction_matrix": "InteractionMatrix",
     "escape_hw.api.mirror": "DMInfo DeformableMirror SendReport",
     "escape_hw.api.modulator": "Modulation ModulatorInfo ModulatorStatus TipTiltModulator",
@@ -78,9 +82,11 @@ _NAMES = {
     "escape_hw.calibration.loop.performance": "close_loop",
     "escape_hw.calibration.push_pull.procedure": "push_pull",
     "escape_hw.calibration.sprint.fit": "sprint",
+    "escape_hw.calibration.sprint.influence_estimate": "estimate_influence_functions",
     "escape_hw.config.bundled": "bundled_systems",
     "escape_hw.config.loader": "load_system",
     "escape_hw.config.registry": "DeviceContext register_device",
+    "escape_hw.io.fits.influence": "load_influence save_influence",
     "escape_hw.io.fits.matrix": "load_matrix save_matrix",
     "escape_hw.remote.client": "Connection connect",
     "escape_hw.runtime.session.system": "System open_system",
@@ -96,14 +102,15 @@ _PUBLIC_MODULES = {
 __all__ = [
     "AdaptiveSecondary", "CalibrationResult", "Camera", "CameraInfo", "CameraSettings", "Checkpoint",
     "Connection", "DMInfo", "DeformableMirror", "DeviceContext", "Estimate", "Frame",
-    "InteractionMatrix", "LoopResult", "MirrorLimits", "Modulation", "ModulatorInfo", "ModulatorStatus",
-    "PhaseScreen", "Procedure", "Progress", "PyramidPupils", "Region", "Registration",
-    "RegistrationEstimate", "Reporter", "ScreenInfo", "ScreenState", "SendReport", "SensorGeometry",
-    "ShellHealth", "ShellState", "SubApertureGrid", "System", "Target", "TipTiltModulator",
-    "__version__", "bundled_systems", "close_loop", "connect", "docrime", "docrime_closed_loop",
-    "errors", "escape", "find_best_gain", "find_sensor", "load_matrix", "load_system", "measure_dark",
+    "InfluenceEstimate", "InfluenceProfile", "InteractionMatrix", "LoopResult", "MirrorLimits",
+    "Modulation", "ModulatorInfo", "ModulatorStatus", "PhaseScreen", "Procedure", "Progress",
+    "PyramidPupils", "Region", "Registration", "RegistrationEstimate", "Reporter", "ScreenInfo",
+    "ScreenState", "SendReport", "SensorGeometry", "ShellHealth", "ShellState", "SubApertureGrid",
+    "System", "Target", "TipTiltModulator", "__version__", "bundled_systems", "close_loop", "connect",
+    "docrime", "docrime_closed_loop", "errors", "escape", "estimate_influence_functions",
+    "find_best_gain", "find_sensor", "load_influence", "load_matrix", "load_system", "measure_dark",
     "measure_model_psf", "open_device", "open_system", "push_pull", "register_device", "run",
-    "save_matrix", "sprint", "testing",
+    "save_influence", "save_matrix", "sprint", "testing",
 ]  # fmt: skip
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from escape_hw.api.influence import InfluenceProfile
 from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.optical_gains import ClosureStep, GainRound, GainsResult, OpticalGains
 from escape_hw.api.registration import Registration
@@ -102,8 +103,20 @@ def registration(scale: float = 1.0, seed: int = 3) -> RegistrationEstimate:
             rng.normal(0, 0.02, 97),
             np.array([0.0, 0.0, 0.03]),
             rng.normal(0, 2.0, (2, 97)),
+            np.full(97, 0.01),
+            np.full((2, 97), 0.5),
+            1e-6 * np.eye(4),
         ),
+        influence_profile=influence_profile(),
     )
+
+
+def influence_profile() -> InfluenceProfile:
+    """Profile of a rounded exponential beside a Gaussian nominal one."""
+    radius = np.arange(0.0, 4.01, 0.1)
+    fitted = np.exp(-(np.hypot(radius, 0.27) - 0.27) / 0.9)
+    sigma = 0.01 * radius * fitted
+    return InfluenceProfile(radius, np.exp(-0.92 * radius**2), fitted, sigma, 1.1 * fitted, 2 * sigma)
 
 
 def calibration(

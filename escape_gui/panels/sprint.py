@@ -1,4 +1,4 @@
-"""Convergence of SPRINT, and drift of the registration during tracking."""
+"""Convergence of SPRINT, drift of the registration during tracking, and the fitted mirror."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from escape_gui.panels.base import Context, ExportArray, Panel
 from escape_gui.views.convergence import NAMES, UNITS, ConvergenceHistory, RegistrationDrift, short_unit
 from escape_gui.widgets.controls import QUALITY_LEVELS, Level, StatusIndicator, column, row, text_label
 from escape_gui.widgets.plots import MARKERS, ConvergencePlot, DriftPlot
+from escape_gui.widgets.profile_plot import ProfilePlot
 from escape_hw.api.registration import PARAMETERS
 from escape_hw.api.results import Estimate
 from escape_hw.remote.source import Sample
@@ -22,13 +23,14 @@ from escape_hw.report.verdict import Quality, assess
 
 
 class SprintPanel(Panel):
-    """Two tabs: iterations of the fit, and drift since the start of tracking."""
+    """Three tabs: iterations of the fit, drift since the start of tracking, fitted influence functions."""
 
     name = "sprint"
     title = "Registration"
     help = (
         "Step norm of SPRINT and the five parameters of the registration by iteration, with the standard "
-        "errors of the result. The second tab shows them over time while the tracker runs."
+        "errors of the result. The second tab shows them over time while the tracker runs, the third one the "
+        "profile of the influence functions that SPRINT has found."
     )
     streams: ClassVar[tuple[str, ...]] = (
         "registration", "registration_sigma", "step_norm", "registration_track",
@@ -51,6 +53,8 @@ class SprintPanel(Panel):
         self.tabs.setDocumentMode(True)
         self.tabs.addTab(self._make_convergence(), "Fit")
         self.tabs.addTab(self.drift, "Drift")
+        self.profile = ProfilePlot(context.theme)
+        self.tabs.addTab(self.profile, "Mirror")
         self.body.addWidget(self.tabs)
         self.setFocusProxy(self.units)
 
@@ -114,6 +118,8 @@ class SprintPanel(Panel):
             marks += [(float(one["seconds"]), "alarm") for one in self._document.get("alarms") or ()]
             self.drift.show_drift(RegistrationDrift.of(self._data["registration_track"], marks))
 
+        self.profile.show_profile(self._document.get("influence_profile"))
+
     def _show_history(self) -> None:
         converged = self._document.get("converged")
         self._history = history = ConvergenceHistory.of(
@@ -145,6 +151,7 @@ class SprintPanel(Panel):
         self._history, self._document, self._last_result_id = None, {}, -1
         self.plot.show_convergence(None)
         self.drift.show_drift(RegistrationDrift.of(np.zeros((0, 11))))
+        self.profile.show_profile(None)
         self.tabs.setCurrentIndex(0)
 
     def apply_theme(self) -> None:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from escape_hw.api.influence import InfluenceProfile
 from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.registration import PARAMETERS, UNITS, Registration
 from escape_hw.api.representation import line_html, short_repr, table_html
@@ -35,6 +36,11 @@ class ActuatorCorrections:
     position
         Position of every actuator along x and y beyond the nominal one, in % of a sub-aperture ``(2,
         n_act)``.
+    width_sigma, position_sigma
+        Standard errors ``(n_act,)`` and ``(2, n_act)``; 0 in products of earlier versions.
+    shape_covariance
+        Covariance of the common width and the coefficients of the shape ``(1 + n, 1 + n)``; ``None`` in
+        products of earlier versions.
     """
 
     gain: NDArray[np.float64]
@@ -42,6 +48,9 @@ class ActuatorCorrections:
     width: NDArray[np.float64]
     shape: NDArray[np.float64]
     position: NDArray[np.float64]
+    width_sigma: NDArray[np.float64] | float = 0.0
+    position_sigma: NDArray[np.float64] = field(default_factory=lambda: np.zeros((2, 1)))
+    shape_covariance: NDArray[np.float64] | None = None
     __repr__ = short_repr
 
 
@@ -106,6 +115,8 @@ class RegistrationEstimate:
         Fitted differences of the actuators; ``None`` if they were not fitted.
     extras
         Estimates of the extra parameters by name.
+    influence_profile
+        Fitted profile of the influence functions; ``None`` if it was not fitted.
     """
 
     registration: Registration
@@ -119,6 +130,7 @@ class RegistrationEstimate:
     notes: tuple[str, ...] = ()
     actuator_corrections: ActuatorCorrections | None = None
     extras: Mapping[str, Estimate] = field(default_factory=dict)
+    influence_profile: InfluenceProfile | None = None
 
     @property
     def sigma(self) -> NDArray[np.float64]:

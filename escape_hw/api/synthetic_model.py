@@ -82,14 +82,34 @@ PROFILE_WIDTHS = (1.0, 0.35, 0.6, 1.7, 2.9)
 
 @runtime_checkable
 class HasProfile(Protocol):
-    """A model whose nominal influence function is a sum of one function at several widths."""
+    """A model whose nominal influence function is a sum of one function at several widths, or any other."""
 
     @property
     def profile_shares(self) -> tuple[float, ...]:
-        """Share of the function at each of :data:`PROFILE_WIDTHS`."""
+        """Share of the function at each of :data:`PROFILE_WIDTHS`; empty for any other shape."""
 
     def component_model(self) -> SyntheticModel:
         """The same model with the function alone as the nominal influence function."""
+
+
+@runtime_checkable
+class HasSurfaces(Protocol):
+    """A model that gives the surfaces of its influence functions."""
+
+    def surface_model(self, x_m: NDArray[np.float64], y_m: NDArray[np.float64]) -> SyntheticModel:
+        """The same mirror on a sensor of heights instead of slopes.
+
+        Parameters
+        ----------
+        x_m, y_m
+            Coordinates ``(n_x,)`` and ``(n_y,)`` of a grid on the pupil in metres.
+
+        Returns
+        -------
+        SyntheticModel
+            Its zonal matrix has the heights of the grid points, row by row, per unit command ``(n_y * n_x,
+            n_act)`` in fractions of full stroke.
+        """
 
 
 @runtime_checkable

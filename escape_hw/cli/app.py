@@ -11,8 +11,8 @@ import typer
 from escape_hw.cli.calibration import calibrate, reproduce, sweep
 from escape_hw.cli.calibration.procedure_command import procedure_command
 from escape_hw.cli.devices import asm, camera, discover, dm, emulate, modulator, with_stand_ins
+from escape_hw.cli.products import influence, interchange
 from escape_hw.cli.products import inspection as products
-from escape_hw.cli.products import interchange
 from escape_hw.cli.renamed import current_words
 from escape_hw.cli.system import configuration as systems
 from escape_hw.cli.system import doctor, gui, keys, perf, serve, streams, udev
@@ -64,6 +64,7 @@ def build_app() -> typer.Typer:
     app.command("show")(products.show)
     app.command("compare")(products.compare)
     app.command("report")(products.report)
+    app.command("influence")(influence.influence)
     app.command("perf")(perf.perf)
     app.add_typer(dm.app, name="dm")
     app.add_typer(camera.app, name="camera")

@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+import numpy as np
 from rich import box
 from rich.console import JustifyMethod
 from rich.table import Table as RichTable
 from rich.text import Text
 
+from escape_hw.api.influence import InfluenceProfile
 from escape_hw.api.results import CalibrationResult
 from escape_hw.report.tables import Table
 
@@ -64,3 +66,20 @@ def format_criteria(checks: Iterable[Mapping[str, Any]]) -> list[Text]:
 def format_products(products: Mapping[str, Any]) -> list[str]:
     """Paths of the products."""
     return [f"{name}: {path}" for name, path in products.items()]
+
+
+#: Distances in pitches at which a profile is printed.
+_PROFILE_STEP, _PROFILE_END = 0.5, 3.0
+
+
+def profile_lines(profile: InfluenceProfile) -> list[str]:
+    """The profile of the influence functions, a line every half pitch."""
+    wanted = (profile.radius > 0) & (profile.radius < _PROFILE_END + 0.01)
+    wanted &= np.isclose(profile.radius % _PROFILE_STEP, 0) | np.isclose(
+        profile.radius % _PROFILE_STEP, _PROFILE_STEP
+    )
+    return [
+        f"at {profile.radius[k]:.1f} pitches: {profile.fitted[k]:.3f} ± {profile.sigma[k]:.3f} of the peak, "
+        f"nominal {profile.nominal[k]:.3f}"
+        for k in np.flatnonzero(wanted)
+    ]

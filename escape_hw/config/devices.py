@@ -203,14 +203,45 @@ class MirrorConfig(DeviceConfig):
     pitches_across_pupil: float = Field(
         gt=0, le=200, description="actuator pitches across the diameter of the pupil"
     )
-    influence: Literal["gaussian", "exponential"] = Field(
-        "gaussian", description="profile of the nominal influence functions: gaussian or exponential"
+    influence: Literal["gaussian", "exponential", "thin-plate", "file"] = Field(
+        "gaussian", description="nominal influence functions: gaussian, exponential, thin-plate, or file"
     )
     coupling: float = Field(
         ge=0.01, le=0.9, description="nominal influence at the adjacent actuator, fraction of the peak"
     )
     rounding: float = Field(
         0.27, gt=0, le=1, description="radius of the rounded tip of an exponential profile, pitches"
+    )
+    plate_rim: float = Field(
+        0.6, ge=0, le=5, description="width of a thin plate beyond its outermost actuators, pitches"
+    )
+    influence_file: str = Field(
+        "", description="FITS or .npy file with a map per actuator (n_act, n_y, n_x), for the shape file"
+    )
+    influence_pixel_m: float | None = Field(
+        None,
+        gt=0,
+        le=1,
+        description="pixel of influence_file on the mirror, metres; absent: from the actuators on the maps",
+    )
+    influence_unit: Literal["peak", "stroke", "metre", "micrometre", "nanometre"] | None = Field(
+        None,
+        description="unit of the maps: fraction of the median peak or of full stroke, or a length; absent: "
+        "the file's BUNIT, else peak",
+    )
+    influence_poke: float = Field(
+        1.0,
+        ge=-1,
+        le=1,
+        description="command of each map, fraction of full stroke; negative: the maps show the opposite sign",
+    )
+    influence_wavefront: bool = Field(
+        False, description="the maps show the reflected wavefront, twice the surface"
+    )
+    influence_positions: str = Field(
+        "",
+        description="positions of the actuators: 'layout', or a table of columns and rows on the maps (text, "
+        ".npy or FITS); empty: the file's own, or found on the maps",
     )
     stroke_m: float = Field(gt=0, le=1e-3, description="metres of surface at the actuator for a command of 1")
     limits: LimitsConfig = Field(default_factory=LimitsConfig, description="limits of every command")
@@ -256,6 +287,10 @@ class MirrorConfig(DeviceConfig):
         if len(set(self.limits.disabled)) == self.n_act and not bad:
             text = "disables every actuator; leave at least one in service"
             violations.append(RuleViolation("limits.disabled", list(self.limits.disabled), text))
+        if self.influence == "file" and not self.influence_file:
+            violations.append(RuleViolation("influence_file", "", "is required with influence = 'file'"))
+        if self.influence_poke == 0:
+            violations.append(RuleViolation("influence_poke", 0.0, "must not be 0; it scales the maps"))
         if self.position_unit != "pitch" and not self.layout.startswith("points:"):
             text = "is the unit of a layout 'positions:FILE'; other layouts are in pitches; remove it"
             violations.append(RuleViolation("position_unit", self.position_unit, text))

@@ -184,8 +184,10 @@ class TwinMirror(Section):
     four-fold term, positions and edge actuators, and the length unless ``coupling`` sets it.
     """
 
-    shape: Literal["gaussian", "exponential", "thin-plate", "file"] = Field(
-        "gaussian", description="true influence functions: gaussian, exponential, thin-plate, or file"
+    shape: Literal["gaussian", "exponential", "thin-plate", "file", "nominal"] = Field(
+        "gaussian",
+        description="true influence functions: gaussian, exponential, thin-plate, file, or nominal (those of "
+        "devices.dm.influence)",
     )
     gain_scatter: float = Field(0.0, ge=0, le=0.5, description="scatter of the actuator gains, rms fraction")
     coupling: float | None = Field(
@@ -198,7 +200,7 @@ class TwinMirror(Section):
         0.0, ge=0, le=0.5, description="fraction of each influence function in wings wider than its core"
     )
     influence_file: str = Field(
-        "", description="FITS file of measured influence functions (n_act, n, n), for the shape file"
+        "", description="FITS or .npy file of influence functions (n_act, n_y, n_x), for the shape file"
     )
     influence_pixel_m: float | None = Field(
         None, gt=0, le=10, description="pixel size of influence_file on the pupil, metres; needed with a file"

@@ -79,6 +79,7 @@ def registration_document(estimate: RegistrationEstimate | None) -> dict[str, An
         "chi2": estimate.chi2,
         "warnings": list(estimate.warnings),
         "registration_notes": list(estimate.notes),
+        "influence_profile": to_plain_values(estimate.influence_profile),
     }
 
 

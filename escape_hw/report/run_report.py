@@ -124,8 +124,8 @@ def _registration_section(run: RunContent) -> str:
         caption += " Δ: difference from the injected value; no estimator reads it."
     parts = [html.table(tables.registration_table(estimates, run.injected), caption)]
     for number, (label, estimate) in enumerate(estimates.items()):
+        what = f" ({label})" if label else ""
         if estimate.iterations:
-            what = f" ({label})" if label else ""
             parts.append(
                 html.figure(
                     f"sprint{number}",
@@ -133,6 +133,15 @@ def _registration_section(run: RunContent) -> str:
                     f"SPRINT convergence{what}: step norm (top) and the parameters per iteration. "
                     "Band: final value with its standard error."
                     + (" Dotted: injected value." if run.injected is not None else ""),
+                )
+            )
+        if estimate.influence_profile is not None:
+            parts.append(
+                html.figure(
+                    f"influence{number}",
+                    figures_registration.influence_profile(estimate.influence_profile),
+                    f"Influence functions that SPRINT has found{what}: radial profile, of edge actuators "
+                    "along the edge. Bands: standard errors. 'escape influence' writes them as a file.",
                 )
             )
         parts.append(html.note_list(list(estimate.warnings), "bad"))

@@ -230,6 +230,21 @@ def test_sprint_shows_its_iterations_and_its_end(calibrate, source):
     np.testing.assert_allclose(table[:, 2:], path, rtol=1e-6)
 
 
+def test_the_profile_of_the_influence_functions_is_shown(calibrate, source):
+    panel, profile = calibrate.panels["sprint"], fake.influence_profile()
+    document = calibration_document(fake.calibration("escape"))
+    source.push("registration", np.zeros((1, 5)))
+    source.change(last_run=FinishedRun(id=3, name="escape", finish=Finish.DONE, document=document))
+    look(calibrate)
+    panel.tabs.setCurrentWidget(panel.profile)
+    nominal, fitted, edge = (band.line.getData()[1] for band in panel.profile.bands)
+    np.testing.assert_allclose(nominal, profile.nominal)
+    np.testing.assert_allclose(fitted, profile.fitted)
+    np.testing.assert_allclose(edge, profile.edge)
+    panel.clear()
+    assert all(not len(band.line.xData) for band in panel.profile.bands if band.line.xData is not None)
+
+
 def test_a_drift_is_shown(calibrate, source):
     panel = calibrate.panels["sprint"]
     track = np.zeros((30, 11))

@@ -25,7 +25,7 @@ def test_help_is_quick_and_light():
     assert done.returncode == 0, done.stderr
     for command in (
         "systems", "config", "calibrate", "sprint", "gains", "loop", "track", "reproduce", "show", "compare",
-        "report", "perf", "dm", "camera", "asm", "doctor", "discover", "udev", "emulate",
+        "report", "influence", "perf", "dm", "camera", "asm", "doctor", "discover", "udev", "emulate",
     ):  # fmt: skip
         assert command in done.stdout
 

@@ -4,18 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from astropy.io import fits
 
 from escape_hw.api.registration import Registration
-from escape_hw.errors import ConfigError
 from escape_sim.mirror.influence_functions import (
     InfluenceFunctions,
-    MeasuredInfluenceFunctions,
     exponential_length,
     exponential_profile,
     layout_positions,
-    read_influence_functions,
 )
+from escape_sim.mirror.measured import MeasuredInfluenceFunctions
 from escape_sim.mirror.surface import DenseSurface, GriddedSurface, WindowedSurface, make_mirror_surface
 
 PITCH, D = 0.75e-3, 0.28e-3
@@ -204,27 +201,10 @@ def test_measured_shapes_carry_gains_and_end_where_nothing_was_measured():
     assert np.abs(fast(command) - want).max() < 5e-6
 
 
-@pytest.mark.parametrize("cube", [np.zeros((3, 4)), np.zeros((2, 4, 5)), np.full((2, 4, 4), np.nan)])
+@pytest.mark.parametrize("cube", [np.zeros((3, 4)), np.full((2, 4, 4), np.nan)])
 def test_what_is_no_stack_of_surfaces_is_refused(cube):
     with pytest.raises(ValueError, match="influence functions"):
         MeasuredInfluenceFunctions(cube, FINE)
-
-
-def test_influence_functions_from_a_file(tmp_path):
-    cube = np.random.default_rng(1).normal(size=(5, 8, 8))
-    fits.writeto(tmp_path / "if.fits", cube)
-    assert np.array_equal(read_influence_functions(str(tmp_path / "if.fits"), 5), cube)
-    with pytest.raises(ConfigError, match=r"shape \(5, 8, 8\); influence functions of 97"):
-        read_influence_functions(str(tmp_path / "if.fits"), 97)
-    with pytest.raises(ConfigError, match=r"cannot be read from .*none\.fits"):
-        read_influence_functions(str(tmp_path / "none.fits"), 5)
-    (tmp_path / "text.fits").write_text("no")
-    with pytest.raises(ConfigError, match="cannot be read"):
-        read_influence_functions(str(tmp_path / "text.fits"), 5)
-    cube[0, 0, 0] = np.nan
-    fits.writeto(tmp_path / "nan.fits", cube)
-    with pytest.raises(ConfigError, match="not finite"):
-        read_influence_functions(str(tmp_path / "nan.fits"), 5)
 
 
 @pytest.mark.parametrize("rounding", [0.18, 0.27, 0.35])
@@ -239,3 +219,30 @@ def test_a_sum_of_gaussians_approximates_a_rounded_exponential(coupling, roundin
     found = sum(share * np.exp(-0.5 * (r / (sigma * width)) ** 2) for share, width in profile)
     slope, error = np.gradient(exact, r), np.gradient(found - exact, r)
     assert np.sqrt(np.sum(r * error**2) / np.sum(r * slope**2)) < 0.06
+
+
+@pytest.mark.parametrize("registration", [Registration(), GENERAL, ANAMORPHIC], ids=str)
+def test_derivatives_of_measured_shapes(registration):
+    shapes = MeasuredInfluenceFunctions(
+        mirror().surfaces(Registration(), D, GRID, GRID), FINE, positions_m=mirror().positions_m
+    ).with_width(1.1)
+    parts = shapes.jacobian(registration, D, X, Y, slice(3, 9), float)
+    assert parts[0] == pytest.approx(np.moveaxis(shapes.surfaces(registration, D, X, Y)[3:9], 0, 2))
+    point = np.append(registration.to_array(), 1.1)
+    for k, step in enumerate(np.diag([0.1, 0.1, 0.01, 0.01, 0.01, 1e-3])):
+        above, below = (
+            shapes.with_width(p[5]).surfaces(Registration(*p[:5], registration.anamorphosis_angle), D, X, Y)[
+                3:9
+            ]
+            for p in (point + step, point - step)
+        )
+        numeric = np.moveaxis(above - below, 0, 2) / (2 * step.sum())
+        assert np.abs(parts[1 + k] - numeric).max() < 1e-3 * np.abs(numeric).max()
+
+
+def test_a_width_stretches_measured_shapes_about_their_actuators():
+    shapes = MeasuredInfluenceFunctions(
+        mirror().surfaces(Registration(), D, GRID, GRID), FINE, positions_m=mirror().positions_m
+    )
+    found = shapes.with_width(1.2).surfaces(GENERAL, D, X, Y)
+    assert np.abs(found - mirror(width=1.2).surfaces(GENERAL, D, X, Y)).max() < 2e-3

@@ -119,7 +119,7 @@ def test_page_shows_everything(page):
         "&lt;script&gt;alert(1)",
     ):  # fmt: skip
         assert word in page, word
-    assert page.count("<figure>") == 11
+    assert page.count("<figure>") == 12
     assert "ABORTED" not in page
 
 

@@ -24,7 +24,8 @@ from escape_hw.calibration.sprint.covariance import sandwich_covariance, systema
 from escape_hw.calibration.sprint.diagnostics import describe_degeneracies
 from escape_hw.calibration.sprint.extra_parameters import build_extra_parameters
 from escape_hw.calibration.sprint.goodness_of_fit import check_fit, describe_misfit
-from escape_hw.calibration.sprint.mixed_effects import GAIN, WIDTH, MixedEffectsState, PriorEstimate
+from escape_hw.calibration.sprint.influence_estimate import estimate_profile
+from escape_hw.calibration.sprint.mixed_effects import GAIN, SHAPE, WIDTH, MixedEffectsState, PriorEstimate
 from escape_hw.calibration.sprint.mode_choice import choose_modes
 from escape_hw.calibration.sprint.normal_equations import Priors
 from escape_hw.calibration.sprint.solvers import MAX_STEP, SolverContext, SprintSolution, solve
@@ -267,8 +268,8 @@ def fit_registration(
     with limit_to_one_thread():
         estimate = _build_estimate(context, weighted, solution, covariance)
         estimate = replace(estimate, notes=(*notes, *estimate.notes))
-        if actuator_model == "fitted" and solution.actuator_corrections is not None:
-            estimate = replace(estimate, actuator_corrections=solution.actuator_corrections())
+        if actuator_model == "nominal":
+            estimate = replace(estimate, actuator_corrections=None)
     yield context.progress(estimate.sigma)
     return SprintFit(estimate, solution.zonal_matrix, solution.estimate_priors, solution.state)
 
@@ -403,7 +404,22 @@ def _build_estimate(
         warnings,
         notes,
         extras={one.model.name: one.to_estimate(sigma, model_sigma) for one in solution.extras},
+        **_fitted_mirror(context, solution, covariance),
     )
+
+
+def _fitted_mirror(
+    context: SolverContext, solution: SprintSolution, covariance: NDArray[np.float64]
+) -> dict[str, Any]:
+    """Corrections of the actuators and profile of the influence functions, for solvers that fit them."""
+    if solution.state is None or solution.actuator_corrections is None:
+        return {}
+    shape = solution.state.shape
+    common = covariance[WIDTH : SHAPE + shape.size, WIDTH : SHAPE + shape.size].copy()
+    return {
+        "actuator_corrections": replace(solution.actuator_corrections(), shape_covariance=common),
+        "influence_profile": estimate_profile(context.model, solution.width, shape, common),
+    }
 
 
 def check_convergence(

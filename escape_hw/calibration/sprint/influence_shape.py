@@ -10,6 +10,7 @@ asymmetry of their own. All terms are linear in the slopes.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,8 +73,14 @@ class InfluenceShape:
     def __init__(self, model: SyntheticModel) -> None:
         self._shares = np.eye(len(PROFILE_WIDTHS))[0]
         self._model = model
+        self._given: SyntheticModel | None = None
         if isinstance(model, HasProfile):
-            self._shares, self._model = np.array(model.profile_shares), model.component_model()
+            self._model = model.component_model()
+            if model.profile_shares:
+                self._shares = np.array(model.profile_shares)
+            else:
+                # A shape that is no sum of the components: they are added to it.
+                self._shares, self._given = np.zeros(len(PROFILE_WIDTHS)), model
         self._widths = PROFILE_WIDTHS[1:]
         n = len(self._widths)
         self.names = [f"profile_{width:g}" for width in self._widths]
@@ -115,7 +122,11 @@ class InfluenceShape:
             Coefficient of each term ``(n_terms,)``.
         """
         single, by_single = zonal_jacobian(self._model, registration, width)
-        nominal, base = self._shares[0] * single, self._shares[0] * by_single
+        if self._given is not None:
+            given: Any = zonal_jacobian(self._given, registration, width)
+            nominal, base = given
+        else:
+            nominal, base = self._shares[0] * single, self._shares[0] * by_single
         jacobian, profile, outward = 0.0, [], [self._outward_derivative(by_single)]
         for relative_width, nominal_share, share in zip(
             self._widths, self._shares[1:], coefficients, strict=False
@@ -169,6 +180,8 @@ class InfluenceShape:
                 for w, relative in zip(weights, PROFILE_WIDTHS, strict=True)
             ],
         )
+        if self._given is not None:
+            matrix = matrix + self._given.zonal_matrix(registration, width) * (1 + edge_gain * edge)
         return _add(matrix, kept, kept_terms)
 
     def _outward_derivative(self, jacobian: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -331,9 +331,11 @@ class MixedEffectsProblem:
         ]
         noise = self.weighted.noise_level(system.residual)
         # Rounding makes variances negative where a solution that is refused has no information.
-        gain_sigma = noise * np.sqrt(np.maximum(variance[: self.model.n_act], 0.0))
+        sigma = noise * np.sqrt(np.maximum(variance, 0.0)).reshape(N_ACTUATOR_EFFECTS, -1)
         gain, width, *position = state.actuator
-        return ActuatorCorrections(gain, gain_sigma, width, state.shape, np.array(position))
+        return ActuatorCorrections(
+            gain, sigma[0], width, state.shape, np.array(position), sigma[1], sigma[2:]
+        )  # fmt: skip
 
     def move(self, state: MixedEffectsState, step: NDArray[np.floating]) -> MixedEffectsState:
         """The state after a step, in the order of the unknowns."""

@@ -11,11 +11,12 @@ from typing import Any
 import numpy as np
 from rich.console import RenderableType
 
-from escape_hw.cli.formatting import format_calibration, rich_table
+from escape_hw.cli.formatting import format_calibration, profile_lines, rich_table
 from escape_hw.errors import ProductError
 from escape_hw.io import documents
 from escape_hw.io.fits.frames import KIND_FRAMES, load_frames
 from escape_hw.io.fits.gains import KIND_GAINS, load_gains
+from escape_hw.io.fits.influence import KIND_INFLUENCE, load_influence
 from escape_hw.io.fits.loop import KIND_PSF, load_loop
 from escape_hw.io.fits.matrix import KIND_MATRIX, load_matrix
 from escape_hw.io.fits.run_state import KIND_STATE, load_state
@@ -53,6 +54,18 @@ def _telemetry(file: Path) -> ProductSummary:
     frames, n_slopes = result.slopes.shape
     document = {"frames": frames, "n_slopes": n_slopes, "rate_hz": result.rate_hz}
     return document, [f"{frames} frames of {n_slopes} slopes at {result.rate_hz:.6g} Hz"]
+
+
+def _influence(file: Path) -> ProductSummary:
+    found = load_influence(file).result
+    document = {
+        "n_act": len(found.gain), "pitch_m": found.pitch_m, "shape": list(found.surfaces.shape[1:]),
+        "profile": asdict(found.profile),
+    }  # fmt: skip
+    return document, [
+        f"influence functions of {len(found.gain)} actuators, {int(found.edge.sum())} at the edge",
+        *profile_lines(found.profile),
+    ]
 
 
 def _loop(file: Path) -> ProductSummary:
@@ -100,6 +113,7 @@ def _state(file: Path) -> ProductSummary:
 _SUMMARIES: dict[str, Callable[[Path], ProductSummary]] = {
     KIND_FRAMES: _frames,
     KIND_GAINS: _gains,
+    KIND_INFLUENCE: _influence,
     KIND_MATRIX: _matrix,
     KIND_PSF: _loop,
     KIND_STATE: _state,

@@ -12,6 +12,7 @@ import numpy as np
 from astropy.io import fits
 from numpy.typing import NDArray
 
+from escape_hw.api.influence import InfluenceProfile
 from escape_hw.api.pyramid import PyramidPupils
 from escape_hw.api.registration import PARAMETERS, Registration
 from escape_hw.api.results import (
@@ -201,6 +202,7 @@ def pack_registration(estimate: RegistrationEstimate) -> list[Any]:
         iterations,
         pack_metrics(notes, "ALPHANOT"),
         *([] if estimate.actuator_corrections is None else _pack_actuators(estimate.actuator_corrections)),
+        *([] if estimate.influence_profile is None else [pack_profile(estimate.influence_profile)]),
     ]
 
 
@@ -208,18 +210,30 @@ def pack_registration(estimate: RegistrationEstimate) -> list[Any]:
 _PEDESTAL_TERM = 2
 
 
-def _pack_actuators(corrections: ActuatorCorrections) -> list[fits.BinTableHDU]:
+#: Columns of the errors of width and positions, which products of early versions do not have.
+_ACTUATOR_ERRORS = ("WIDTH_SIG", "SHIFT_X_SIG", "SHIFT_Y_SIG")
+
+
+def _pack_actuators(corrections: ActuatorCorrections) -> list[Any]:
     columns = {
         "GAIN": corrections.gain, "SIGMA": corrections.gain_sigma, "WIDTH": corrections.width,
         "SHIFT_X": corrections.position[0], "SHIFT_Y": corrections.position[1],
     }  # fmt: skip
-    return [
+    errors = corrections.width_sigma, *corrections.position_sigma
+    for name, sigma in zip(_ACTUATOR_ERRORS, errors, strict=True):
+        columns[name] = np.broadcast_to(sigma, corrections.gain.shape)
+    hdus = [
         fits_file.table_extension("ACTUATOR", columns),
         fits_file.table_extension("SHAPE", {"VALUE": corrections.shape}),
     ]
+    if corrections.shape_covariance is not None:
+        hdus.append(
+            fits_file.image_extension("SHAPECOV", np.asarray(corrections.shape_covariance, np.float64))
+        )
+    return hdus
 
 
-def _unpack_actuators(hdus: fits.HDUList) -> ActuatorCorrections | None:
+def _unpack_actuators(path: Path, hdus: fits.HDUList) -> ActuatorCorrections | None:
     """``None`` where SPRINT did not fit actuators."""
     if "ACTUATOR" not in hdus:
         return None
@@ -229,7 +243,40 @@ def _unpack_actuators(hdus: fits.HDUList) -> ActuatorCorrections | None:
         shape[_PEDESTAL_TERM] = float(hdus["ACTUATOR"].header["PEDESTAL"])
         return ActuatorCorrections(gain, sigma, width, shape, np.zeros((2, gain.size)))
     position = np.stack([_column(hdus, "ACTUATOR", name) for name in ("SHIFT_X", "SHIFT_Y")])
-    return ActuatorCorrections(gain, sigma, width, _column(hdus, "SHAPE", "VALUE"), position)
+    shape = _column(hdus, "SHAPE", "VALUE")
+    if "SHAPECOV" not in hdus:
+        return ActuatorCorrections(gain, sigma, width, shape, position)
+    errors = [_column(hdus, "ACTUATOR", name) for name in _ACTUATOR_ERRORS]
+    return ActuatorCorrections(
+        gain, sigma, width, shape, position, errors[0], np.stack(errors[1:]),
+        fits_file.read_array(path, hdus, "SHAPECOV", np.float64),
+    )  # fmt: skip
+
+
+#: Columns of the profile of the influence functions and its attributes.
+_PROFILE_COLUMNS = {
+    "RADIUS": "radius", "NOMINAL": "nominal", "FITTED": "fitted", "SIGMA": "sigma", "EDGE": "edge",
+    "EDGE_SIG": "edge_sigma",
+}  # fmt: skip
+
+
+def pack_profile(profile: InfluenceProfile) -> fits.BinTableHDU:
+    """Profile of the influence functions; NaN where there is none of edge actuators."""
+    columns = {key: np.asarray(getattr(profile, name)) for key, name in _PROFILE_COLUMNS.items()}
+    missing = np.full(profile.radius.size, np.nan)
+    return fits_file.table_extension(
+        "PROFILE", {key: values if values.size else missing for key, values in columns.items()}
+    )
+
+
+def unpack_profile(hdus: fits.HDUList) -> InfluenceProfile | None:
+    """Inverse of :func:`pack_profile`; ``None`` when the product has none."""
+    if "PROFILE" not in hdus:
+        return None
+    columns = {name: _column(hdus, "PROFILE", key) for key, name in _PROFILE_COLUMNS.items()}
+    if np.isnan(columns["edge"]).all():
+        columns |= {"edge": np.zeros(0), "edge_sigma": np.zeros(0)}
+    return InfluenceProfile(**columns)
 
 
 def unpack_registration(path: Path, hdus: fits.HDUList) -> RegistrationEstimate | None:
@@ -266,7 +313,8 @@ def unpack_registration(path: Path, hdus: fits.HDUList) -> RegistrationEstimate 
         extras={
             names[k]: Estimate(float(value[k]), float(sigma[k]), units[k]) for k in range(n + 2, len(names))
         },
-        actuator_corrections=_unpack_actuators(hdus),
+        actuator_corrections=_unpack_actuators(path, hdus),
+        influence_profile=unpack_profile(hdus),
     )
 
 

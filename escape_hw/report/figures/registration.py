@@ -1,4 +1,4 @@
-"""Figures of SPRINT: how it converged, and how its error falls with the frames used."""
+"""Figures of SPRINT: convergence, fitted influence functions, and error against the frames used."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullLocator
 
+from escape_hw.api.influence import InfluenceProfile
 from escape_hw.api.registration import PARAMETERS, Registration
 from escape_hw.api.results import RegistrationEstimate
 from escape_hw.report.figures import style
@@ -53,6 +54,27 @@ def convergence(estimate: RegistrationEstimate, injected: Registration | None = 
     panels[-1].set_xlabel("iteration")
     panels[-1].xaxis.set_major_locator(MaxNLocator(integer=True))
     figure.align_ylabels(list(panels))
+    return figure
+
+
+def influence_profile(profile: InfluenceProfile) -> Figure:
+    """Nominal and fitted profile of the influence functions, the fitted ones with standard errors."""
+    figure = style.new_figure(7.8, 3.4)
+    panels = figure.subplots(1, 2)
+    curves = [(profile.fitted, profile.sigma, "fitted", style.SERIES[0])]
+    if profile.edge.size:
+        curves.append((profile.edge, profile.edge_sigma, "fitted, edge actuators", style.SERIES[1]))
+    panels[0].plot(profile.radius, profile.nominal, "--", color=style.INK, lw=1.1, label="nominal")
+    for values, sigma, label, colour in curves:
+        panels[0].plot(profile.radius, values, color=colour, lw=1.4, label=label)
+        panels[1].plot(profile.radius, values - profile.nominal, color=colour, lw=1.4)
+        for panel, middle in zip(panels, (values, values - profile.nominal), strict=True):
+            low, high = middle - sigma, middle + sigma
+            panel.fill_between(profile.radius, low, high, color=colour, alpha=0.3, lw=0)
+    panels[1].axhline(0, color=style.INK, lw=1.1, ls="--")
+    for panel, label in zip(panels, ("surface [peak]", "difference from nominal [peak]"), strict=True):
+        style.style_axes(panel).set(xlabel="distance from the actuator [pitches]", ylabel=label)
+    panels[0].legend(frameon=False, fontsize=8, labelcolor=style.INK)
     return figure
 
 

@@ -17,11 +17,12 @@ from escape_sim.mirror.dynamics import MirrorDynamics
 from escape_sim.mirror.influence_functions import (
     SINGLE_GAUSSIAN,
     InfluenceFunctions,
-    MeasuredInfluenceFunctions,
     actuator_positions,
     pitch_on_pupil,
-    read_influence_functions,
 )
+from escape_sim.mirror.influence_maps import fill_gaps, read_cube
+from escape_sim.mirror.measured import MeasuredInfluenceFunctions
+from escape_sim.mirror.nominal import nominal_influence_functions
 from escape_sim.mirror.rounded_exponential import draw_exponential
 from escape_sim.mirror.surface import DriftingSurface, Flexure, InfluenceModel
 from escape_sim.mirror.thin_plate import thin_plate_surfaces
@@ -307,13 +308,16 @@ class SimBench:
                 profile=profile,
             )  # fmt: skip
         gain = 1 + mirror.gain_scatter * truth.standard_normal(n)
+        if shape == "nominal":
+            return nominal_influence_functions(self.config).with_gain(gain)
         if shape == "thin-plate":
             surfaces, pixel = thin_plate_surfaces(positions / pitch, coupling)
             return MeasuredInfluenceFunctions(surfaces, pixel * pitch, gain)
         if mirror.influence_pixel_m is None:
             raise ConfigError("twin.mirror.influence_pixel_m is required with twin.mirror.influence_file")
-        surfaces = read_influence_functions(mirror.influence_file, n)
-        return MeasuredInfluenceFunctions(surfaces, mirror.influence_pixel_m, gain)
+        pixel = mirror.influence_pixel_m
+        surfaces = fill_gaps(read_cube(mirror.influence_file, n), pitch / pixel)
+        return MeasuredInfluenceFunctions(surfaces, pixel, gain)
 
     def _make_aberration(self, truth: np.random.Generator, rms_m: float, n_modes: int) -> NDArray[np.float32]:
         """Random low-order polynomials, orthonormal over the pupil, of ``rms_m`` over it."""

@@ -1,19 +1,17 @@
-"""Influence functions of a deformable mirror under any registration, of Gaussians or measured on a grid."""
+"""Influence functions of a deformable mirror under any registration, as sums of Gaussians."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage, optimize
+from scipy import optimize
 from scipy.special import factorial
 
 from escape_hw.api.registration import Registration
 from escape_hw.api.synthetic_model import PROFILE_WIDTHS
-from escape_hw.errors import ConfigError
 
 if TYPE_CHECKING:
     from escape_hw.config.system import SystemConfig
@@ -78,6 +76,14 @@ class InfluenceFunctions:
         """Number of actuators."""
         return len(self.positions_m)
 
+    def with_width(self, width: float) -> Self:
+        """The same functions, ``width`` times as wide."""
+        return replace(self, width=width)
+
+    def with_gain(self, gain: NDArray[np.float64]) -> Self:
+        """The same functions with these gains ``(n_act,)``."""
+        return replace(self, gain=gain)
+
     def registered_positions(self, registration: Registration, sub_aperture_m: float) -> NDArray[np.float64]:
         """Positions ``(n_act, 2)`` in metres under a registration."""
         matrix, offset = registration.affine(sub_aperture_m)
@@ -137,17 +143,6 @@ class InfluenceFunctions:
         return np.asarray(np.einsum("yat,xat->ayx", along_y, along_x))
 
 
-def nominal_influence_functions(config: SystemConfig) -> InfluenceFunctions:
-    """Influence functions of the design's mirror."""
-    mirror = config.devices.dm
-    profile: tuple[tuple[float, float], ...] = SINGLE_GAUSSIAN
-    if mirror.influence == "exponential":
-        profile = exponential_profile(mirror.coupling, mirror.rounding)
-    return InfluenceFunctions(
-        actuator_positions(config), pitch_on_pupil(config), mirror.coupling, profile=profile
-    )
-
-
 def exponential_length(coupling: float, rounding: float) -> float:
     """Length ``L`` in pitches of a rounded exponential ``exp(-(sqrt(r^2 + w^2) - w) / L)`` of a coupling."""
     return float((np.hypot(1, rounding) - rounding) / -np.log(coupling))
@@ -189,93 +184,3 @@ def _cross_term_weights(q: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.ones(1)
     k = np.arange(1 + int(np.ceil(np.log(_NEGLIGIBLE) / np.log(ratio))))
     return np.asarray((-q[0, 1]) ** k / factorial(k))
-
-
-class MeasuredInfluenceFunctions:
-    """Influence functions measured on a grid, interpolated by cubic splines.
-
-    A registration shifts, rotates and stretches the whole surface, the shapes with the positions.
-    The surface is zero outside the measured square.
-
-    Parameters
-    ----------
-    surfaces
-        Surfaces per unit command ``(n_act, n, n)`` in fractions of full stroke; x along columns, y
-        along rows, the mirror's centre in the middle of the array.
-    pixel_m
-        Distance between grid points on the pupil in metres.
-    gain
-        Gain of each actuator, one number or ``(n_act,)``.
-
-    Raises
-    ------
-    ValueError
-        The surfaces are not ``(n_act, n, n)`` or not finite, or the pixel is not positive.
-    """
-
-    def __init__(
-        self, surfaces: NDArray[np.float64], pixel_m: float, gain: float | NDArray[np.float64] = 1.0
-    ) -> None:
-        cube = np.asarray(surfaces, dtype=float)
-        if cube.ndim != 3 or cube.shape[1] != cube.shape[2] or min(cube.shape) < 1:
-            raise ValueError(f"the influence functions have shape {cube.shape}; it must be (n_act, n, n)")
-        if not np.isfinite(cube).all() or not pixel_m > 0:
-            raise ValueError(
-                f"influence functions must be finite, and their pixel of {pixel_m} m must be positive"
-            )
-        scaled = cube * np.broadcast_to(np.asarray(gain, dtype=float), (len(cube),))[:, None, None]
-        # A margin of zeros prevents ringing of the spline at the edge of the measured square.
-        self._margin = 4
-        padded = np.pad(scaled, ((0, 0), (self._margin,) * 2, (self._margin,) * 2))
-        self._splines = np.stack([ndimage.spline_filter(s, order=3, mode="mirror") for s in padded])
-        self._n, self._pixel = cube.shape[1], pixel_m
-
-    @property
-    def n_act(self) -> int:
-        """Number of actuators."""
-        return len(self._splines)
-
-    def surfaces(
-        self,
-        registration: Registration,
-        sub_aperture_m: float,
-        x_m: NDArray[np.float64],
-        y_m: NDArray[np.float64],
-    ) -> NDArray[np.float64]:
-        """Surfaces per unit command ``(n_act, n_y, n_x)``, fractions of full stroke."""
-        matrix, offset = registration.affine(sub_aperture_m)
-        x, y = np.meshgrid(x_m, y_m)
-        nominal_xy = np.linalg.solve(matrix, np.stack([x.ravel() - offset[0], y.ravel() - offset[1]]))
-        pixel_coordinates = nominal_xy[::-1] / self._pixel + (self._n - 1) / 2 + self._margin
-        out = np.empty((self.n_act, y_m.size, x_m.size))
-        for number, spline in enumerate(self._splines):
-            values = ndimage.map_coordinates(
-                spline, pixel_coordinates, order=3, mode="constant", cval=0.0, prefilter=False
-            )
-            out[number] = values.reshape(out.shape[1:])
-        return out
-
-
-def read_influence_functions(file: str, n_act: int) -> NDArray[np.float64]:
-    """Read influence functions ``(n_act, n, n)`` from the first image of a FITS file.
-
-    Raises
-    ------
-    ConfigError
-        The file cannot be read, or its data have another shape or are not finite.
-    """
-    from astropy.io import fits  # here, so that the synthetic models do not load it
-
-    path = Path(file).expanduser()
-    try:
-        cube = np.asarray(fits.getdata(path), dtype=float)
-    except (OSError, TypeError, ValueError, IndexError) as error:
-        raise ConfigError(f"influence functions cannot be read from {path}: {error}") from error
-    if cube.ndim != 3 or cube.shape[1] != cube.shape[2] or len(cube) != n_act:
-        raise ConfigError(
-            f"{path} holds an array of shape {cube.shape}; influence functions of {n_act} actuators "
-            f"have the shape ({n_act}, n, n)"
-        )
-    if not np.isfinite(cube).all():
-        raise ConfigError(f"{path} holds influence functions that are not finite")
-    return cube

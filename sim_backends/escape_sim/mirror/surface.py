@@ -12,7 +12,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from escape_hw.api.registration import PARAMETERS, Registration
-from escape_sim.mirror.influence_functions import InfluenceFunctions, MeasuredInfluenceFunctions
+from escape_sim.mirror.influence_functions import InfluenceFunctions
+from escape_sim.mirror.measured import MeasuredInfluenceFunctions
 from escape_sim.mirror.rounded_exponential import ExponentialInfluenceFunctions
 
 if TYPE_CHECKING:

@@ -23,13 +23,15 @@ if TYPE_CHECKING:
 
 #: Poisson's ratio of glass and of most membranes is about this.
 _POISSON_RATIO = 0.25
-#: Grid points per pitch, and width of the plate beyond the outermost actuators in pitches.
-_POINTS_PER_PITCH, _RIM = 6, 0.6
+#: Grid points per pitch, and default width of the plate beyond the outermost actuators in pitches.
+_POINTS_PER_PITCH, RIM = 6, 0.6
 #: Range of the spring constant in units of ``D / pitch^2`` that is searched for a coupling.
 _SPRING_RANGE = 1e-2, 1e4
 
 
-def thin_plate_surfaces(positions: NDArray[np.float64], coupling: float) -> tuple[NDArray[np.float64], float]:
+def thin_plate_surfaces(
+    positions: NDArray[np.float64], coupling: float, rim: float = RIM
+) -> tuple[NDArray[np.float64], float]:
     """Influence functions of a plate whose central actuator has a given coupling.
 
     Parameters
@@ -38,6 +40,8 @@ def thin_plate_surfaces(positions: NDArray[np.float64], coupling: float) -> tupl
         Positions of the actuators ``(n_act, 2)`` as (x, y) in pitches.
     coupling
         Surface of the central actuator at its nearest neighbour, relative to its own.
+    rim
+        Width of the plate beyond the outermost actuators in pitches.
 
     Returns
     -------
@@ -52,7 +56,7 @@ def thin_plate_surfaces(positions: NDArray[np.float64], coupling: float) -> tupl
         No stiffness of the springs gives this coupling.
     """
     pixel = 1 / _POINTS_PER_PITCH
-    radius = float(np.linalg.norm(positions, axis=1).max()) + _RIM
+    radius = float(np.linalg.norm(positions, axis=1).max()) + rim
     half = int(np.ceil(radius / pixel)) + 2
     axis = np.arange(-half, half + 1) * pixel
     inside = axis[:, None] ** 2 + axis**2 <= radius**2

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from dataclasses import replace
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Self
 
 import numpy as np
@@ -11,12 +11,16 @@ from numpy.typing import DTypeLike, NDArray
 
 from escape_hw.api.registration import Registration
 from escape_hw.api.synthetic_model import PROFILE_WIDTHS
-from escape_sim.mirror.influence_functions import SINGLE_GAUSSIAN, nominal_influence_functions
+from escape_sim.mirror.influence_functions import InfluenceFunctions
 from escape_sim.mirror.mode_surfaces import GaussianFactors, gaussian_factors
+from escape_sim.mirror.nominal import gaussian_functions, nominal_influence_functions
 from escape_sim.optics.pupil import PupilGeometry
 
 if TYPE_CHECKING:
     from escape_hw.config.system import SystemConfig
+
+#: Values of measured surfaces and their derivatives that are held in memory at once.
+_BLOCK_VALUES = 2e7
 
 
 class DesignModel:
@@ -25,6 +29,7 @@ class DesignModel:
     def __init__(self, config: SystemConfig, pupil: PupilGeometry) -> None:
         self._config, self._pupil = config, pupil
         self._nominal = nominal_influence_functions(config)
+        self._gaussian = gaussian_functions(config)
 
     @property
     def n_act(self) -> int:
@@ -38,14 +43,16 @@ class DesignModel:
 
     @property
     def profile_shares(self) -> tuple[float, ...]:
-        """Share of each width of the profile, see :class:`HasProfile`."""
+        """Share of each width of the profile, see :class:`HasProfile`; none for other shapes."""
+        if not isinstance(self._nominal, InfluenceFunctions):
+            return ()
         shares = {width: share for share, width in self._nominal.profile}
         return tuple(shares.get(width, 0.0) for width in PROFILE_WIDTHS)
 
     def component_model(self) -> Self:
         """The same model with a single Gaussian, see :class:`HasProfile`."""
         single = copy.copy(self)
-        single._nominal = replace(self._nominal, profile=SINGLE_GAUSSIAN)  # noqa: SLF001
+        single._nominal = self._gaussian  # noqa: SLF001
         return single
 
     @property
@@ -53,11 +60,29 @@ class DesignModel:
         """Size of a sub-aperture, or of a pixel of the pupil image, on the pupil in metres."""
         return self._pupil.sub_aperture_m
 
+    def surface_model(self, x_m: NDArray[np.float64], y_m: NDArray[np.float64]) -> SurfaceModel:
+        """The same mirror on a sensor of heights, see :class:`HasSurfaces`."""
+        model = SurfaceModel(self._config, self._pupil, x_m, y_m)
+        model._nominal = self._nominal  # noqa: SLF001
+        return model
+
+    @property
+    def registration_systematic_error(self) -> NDArray[np.float64]:
+        """Error of the place of measured influence functions, see :class:`HasSystematicError`."""
+        if isinstance(self._nominal, InfluenceFunctions):
+            return np.zeros(5)
+        percent = 100 / self.sub_aperture_m
+        return self._nominal.place_sigma * [percent, percent, 1.0, 1.0, 1.0]
+
+    def _is_separable(self, registration: Registration) -> bool:
+        """Whether the surfaces are products of functions of x and y: upright Gaussians."""
+        return isinstance(self._nominal, InfluenceFunctions) and not registration.anamorphosis_angle
+
     def _surfaces(
         self, at_m: NDArray[np.float64], registration: Registration | None = None, width: float = 1.0
     ) -> NDArray[np.float64]:
         """Influence functions ``(n_act, n, n)`` at coordinates ``(n,)`` along either axis."""
-        influence = replace(self._nominal, width=width)
+        influence = self._nominal.with_width(width)
         return influence.surfaces(registration or Registration(), self.sub_aperture_m, at_m, at_m)
 
     def _factors(
@@ -69,7 +94,65 @@ class DesignModel:
         *,
         derivatives: bool = False,
     ) -> GaussianFactors:
-        influence = replace(self._nominal, width=width)
+        """Factors of Gaussian influence functions (ValueError: the nominal ones are on a grid)."""
+        if not isinstance(self._nominal, InfluenceFunctions):
+            raise ValueError("influence functions on a grid have no factors")
+        influence = self._nominal.with_width(width)
         return gaussian_factors(
             influence, registration, self.sub_aperture_m, at_m, at_m, dtype, derivatives=derivatives
         )
+
+    def _measured_jacobian(
+        self,
+        at_m: NDArray[np.float64],
+        registration: Registration,
+        width: float,
+        slopes: Callable[[NDArray[np.floating]], NDArray[np.floating]],
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+        """Zonal matrix and derivatives of influence functions on a grid; ``None`` for Gaussians.
+
+        ``slopes`` computes slopes ``(n_slopes, k)`` of surfaces ``(n, n, k)`` at the coordinates.
+        """
+        if isinstance(self._nominal, InfluenceFunctions):
+            return None
+        influence, n = self._nominal.with_width(width), at_m.size
+        step = max(1, int(_BLOCK_VALUES / (7 * n * n)))
+        parts = []
+        for first in range(0, self.n_act, step):
+            block = influence.jacobian(
+                registration, self.sub_aperture_m, at_m, at_m, slice(first, first + step)
+            )
+            columns = np.ascontiguousarray(block.transpose(1, 2, 0, 3)).reshape(n, n, -1)
+            parts.append(slopes(columns).reshape(-1, len(block), block.shape[3]).transpose(1, 0, 2))
+        joined = np.concatenate(parts, axis=2).astype(float)
+        return joined[0], joined[1:]
+
+
+class SurfaceModel(DesignModel):
+    """The design's mirror on a sensor of heights: its slopes are those of the grid points, row by row."""
+
+    name = "surface"
+
+    def __init__(
+        self,
+        config: SystemConfig,
+        pupil: PupilGeometry,
+        x_m: NDArray[np.float64],
+        y_m: NDArray[np.float64],
+    ) -> None:
+        super().__init__(config, pupil)
+        self._x_m, self._y_m = x_m, y_m
+
+    def influence_functions(self) -> tuple[NDArray[np.float64], NDArray[np.bool_], float]:
+        """Nominal influence functions over the pupil, see :class:`SyntheticModel`."""
+        return self._surfaces(self._pupil.coordinates_m), self._pupil.lit, self._pupil.pixel_m
+
+    def zonal_matrix(self, registration: Registration, width: float = 1.0) -> NDArray[np.float64]:
+        """Heights per unit command ``(n_y * n_x, n_act)`` in fractions of full stroke."""
+        influence = self._nominal.with_width(width)
+        surfaces = influence.surfaces(registration, self.sub_aperture_m, self._x_m, self._y_m)
+        return surfaces.reshape(len(surfaces), -1).T
+
+    def variants(self) -> list[Self]:
+        """No variants: heights do not depend on the sensor."""
+        return []

@@ -19,6 +19,7 @@ from escape_hw.api.registration import Registration
 from escape_hw.api.sensor import SubApertureGrid
 from escape_hw.config.sensor import ShackHartmannSection
 from escape_hw.pipeline.slopes.shack_hartmann import subaperture_windows
+from escape_sim.mirror.influence_functions import InfluenceFunctions
 from escape_sim.mirror.mode_surfaces import N_DERIVATIVES, GaussianFactors, mode_surfaces
 from escape_sim.models.base import DesignModel
 from escape_sim.optics.pupil import PupilGeometry, nominal_flux, pupil_geometry
@@ -406,8 +407,7 @@ class ShackHartmannModel(DesignModel):
 
     def zonal_matrix(self, registration: Registration, width: float = 1.0) -> NDArray[np.float64]:
         """Slopes in pixels per unit command ``(n_slopes, n_act)``, see :class:`SyntheticModel`."""
-        if registration.anamorphosis_angle:
-            # An inclined elliptic Gaussian is not separable in x and y.
+        if not self._is_separable(registration):
             surfaces = np.moveaxis(self._surfaces(self._slopes.nodes_m, registration, width), 0, 2).copy()
             return np.asarray(self._slopes.slopes(surfaces) * self._opd_per_command_m)
         factors = self._factors(self._slopes.nodes_m, registration, width, np.float64)
@@ -427,6 +427,12 @@ class ShackHartmannModel(DesignModel):
         self, registration: Registration, width: float = 1.0
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Zonal matrix and its derivatives, see :class:`DifferentiableModel`; single precision."""
+        measured = self._measured_jacobian(
+            self._slopes.nodes_m, registration, width,
+            lambda surfaces: self._slopes.slopes(surfaces) * np.float32(self._opd_per_command_m),
+        )  # fmt: skip
+        if measured is not None:
+            return measured
         factors = self._factors(self._slopes.nodes_m, registration, width, derivatives=True)
         parts = factors.sum_terms(self._slopes.zonal(factors, derivatives=True))
         parts *= np.float32(self._opd_per_command_m)
@@ -445,6 +451,8 @@ class ShackHartmannModel(DesignModel):
         self, registration: Registration, m2c: NDArray[np.float64], width: float = 1.0
     ) -> NDArray[np.float64]:
         """Slopes per unit mode ``(n_slopes, n_modes)``, see :class:`DifferentiableModel`."""
+        if not self._is_separable(registration):
+            return self.zonal_matrix(registration, width) @ m2c
         factors = self._factors(self._slopes.nodes_m, registration, width)
         if m2c.shape[1] <= _MAX_DIRECT_MODES:
             return np.asarray(
@@ -456,6 +464,9 @@ class ShackHartmannModel(DesignModel):
         self, registration: Registration, m2c: NDArray[np.float64], width: float = 1.0
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Modal matrix and its derivatives, see :class:`DifferentiableModel`; single precision."""
+        if not isinstance(self._nominal, InfluenceFunctions):
+            matrix, derivatives = self.zonal_jacobian(registration, width)
+            return matrix @ m2c, derivatives @ m2c
         factors = self._factors(self._slopes.nodes_m, registration, width, derivatives=True)
         parts = factors.sum_terms(self._slopes.zonal(factors, derivatives=True))
         modes = (m2c * self._opd_per_command_m).astype(np.float32)

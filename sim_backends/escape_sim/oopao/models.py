@@ -13,8 +13,9 @@ from escape_hw.api.registration import Registration
 from escape_hw.api.sensor import SensorGeometry, SubApertureGrid
 from escape_hw.api.synthetic_model import SyntheticModel
 from escape_hw.config.sensor import ShackHartmannSection
-from escape_hw.errors import CalibrationError
+from escape_hw.errors import CalibrationError, ConfigError
 from escape_hw.pipeline.slopes.pyramid import slopes_of_image
+from escape_sim.mirror.influence_functions import InfluenceFunctions
 from escape_sim.models.base import DesignModel
 from escape_sim.models.factory import model_geometry
 from escape_sim.oopao.library import (
@@ -50,6 +51,12 @@ class OOPAOPushPullModel(DesignModel, abc.ABC):
 
     def __init__(self, config: SystemConfig, pupil: PupilGeometry, light: SourceAndTelescope) -> None:
         super().__init__(config, pupil)
+        if not isinstance(self._nominal, InfluenceFunctions):
+            raise ConfigError(
+                f"devices.dm.influence = '{config.devices.dm.influence}' needs calibration.model = 'fast'; "
+                "OOPAO's mirror has Gaussian influence functions, and sums of them ('exponential')"
+            )
+        self._profile = self._nominal.profile
         self._light = light
         n = pupil.n_sub * pupil.n_pix
         # OOPAO's mirror has its n samples from edge to edge, its wavefront at pixel centres: lengths for
@@ -60,7 +67,7 @@ class OOPAOPushPullModel(DesignModel, abc.ABC):
     def influence_functions(self) -> tuple[NDArray[np.float64], NDArray[np.bool_], float]:
         """Nominal influence functions, see :class:`SyntheticModel`."""
         modes = np.sum(
-            [share * self._nominal_mirror(width).modes for share, width in self._nominal.profile],
+            [share * self._nominal_mirror(width).modes for share, width in self._profile],
             axis=0,
             dtype=float,
         )
@@ -75,7 +82,7 @@ class OOPAOPushPullModel(DesignModel, abc.ABC):
         return np.asarray(
             sum(
                 share * self._push_pull(registration, width * relative_width)
-                for share, relative_width in self._nominal.profile
+                for share, relative_width in self._profile
             )
         )
 
@@ -108,9 +115,9 @@ class OOPAOPushPullModel(DesignModel, abc.ABC):
                 self._mirrors[width] = oopao_classes().DeformableMirror(
                     telescope=self._light.telescope,
                     nSubap=self._pupil.n_sub,
-                    mechCoupling=self._nominal.coupling,
-                    coordinates=self._nominal.positions_m * self._edge_factor,
-                    pitch=self._nominal.pitch_m * self._edge_factor * width,
+                    mechCoupling=self._gaussian.coupling,
+                    coordinates=self._gaussian.positions_m * self._edge_factor,
+                    pitch=self._gaussian.pitch_m * self._edge_factor * width,
                     print_dm_properties=False,
                 )
         return self._mirrors[width]
