@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from escape_hw.api.registration import PARAMETERS, UNITS
-from escape_hw.api.results import CalibrationResult, Estimate
+from escape_hw.api.results import CalibrationResult, Estimate, RegistrationEstimate
 from escape_hw.errors import IncompatibleProduct
 from escape_hw.report.figures.matrix import representative_modes
 from escape_hw.report.tables import TITLES, Table, format_with_error
@@ -36,6 +37,9 @@ class MatrixComparison:
         What they are called.
     registration
         B minus A with combined standard errors; empty unless both have one.
+    between_runs
+        The same with their errors between runs of one set-up, which a change is to be compared with; empty
+        unless both have them.
     """
 
     correlation: NDArray[np.float64]
@@ -45,6 +49,7 @@ class MatrixComparison:
     common: int
     elements: str
     registration: dict[str, Estimate]
+    between_runs: dict[str, Estimate]
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values for JSON."""
@@ -56,6 +61,7 @@ class MatrixComparison:
             "total_relative_rms": self.total_relative_rms,
             "median_correlation": float(np.median(self.correlation)),
             "registration_difference": {k: v.to_dict() for k, v in self.registration.items()} or None,
+            "difference_between_runs": {k: v.to_dict() for k, v in self.between_runs.items()} or None,
         }
 
 
@@ -89,21 +95,26 @@ def compare(a: CalibrationResult, b: CalibrationResult) -> MatrixComparison:
         relative = np.sqrt(np.sum((right - left) ** 2, axis=0) / power_left)
     total = math.sqrt(float(np.sum((right - left) ** 2)) / max(float(power_left.sum()), 1e-300))
     return MatrixComparison(
-        correlation, gain, relative, total, int(both.sum()), a.grid.elements, _registration_difference(a, b)
-    )
+        correlation, gain, relative, total, int(both.sum()), a.grid.elements,
+        _registration_difference(a, b, lambda one: one.sigma),
+        _registration_difference(a, b, lambda one: one.repeatability_sigma),
+    )  # fmt: skip
 
 
-def _registration_difference(a: CalibrationResult, b: CalibrationResult) -> dict[str, Estimate]:
+def _registration_difference(
+    a: CalibrationResult,
+    b: CalibrationResult,
+    errors_of: Callable[[RegistrationEstimate], NDArray[np.float64] | None],
+) -> dict[str, Estimate]:
     if a.registration is None or b.registration is None:
         return {}
-    first, second = a.registration.parameters(), b.registration.parameters()
+    first, second = errors_of(a.registration), errors_of(b.registration)
+    if first is None or second is None:
+        return {}
+    change = b.registration.registration.to_array() - a.registration.registration.to_array()
     return {
-        name: Estimate(
-            second[name].value - first[name].value,
-            math.hypot(first[name].sigma, second[name].sigma),
-            UNITS[name],
-        )
-        for name in PARAMETERS
+        name: Estimate(float(value), float(sigma), UNITS[name])
+        for name, value, sigma in zip(PARAMETERS, change, np.hypot(first, second), strict=True)
     }
 
 
@@ -133,9 +144,14 @@ def mode_table(result: MatrixComparison, count: int = 12) -> Table:
 
 
 def registration_table(result: MatrixComparison) -> Table:
-    """Difference of the registrations with combined errors."""
-    rows = tuple(
-        (f"{TITLES[name][0]} [{TITLES[name][1]}]", format_with_error(value))
-        for name, value in result.registration.items()
-    )
-    return Table(("Component", "α(B) − α(A)"), rows)
+    """Difference of the registrations with combined errors, and its significance as a change between runs."""
+    rows = []
+    for name, value in result.registration.items():
+        row = [f"{TITLES[name][0]} [{TITLES[name][1]}]", format_with_error(value)]
+        between = result.between_runs.get(name)
+        if between is not None:
+            significance = f"{between.value / between.sigma:+.1f}" if between.sigma > 0 else "–"
+            row += [f"{between.sigma:.2g}", significance.replace("-", "−")]
+        rows.append(tuple(row))
+    headings = ("± between runs", "change / σ") if result.between_runs else ()
+    return Table(("Component", "α(B) − α(A)", *headings), tuple(rows))
