@@ -127,7 +127,7 @@ def _noise_score_covariance(
     return np.asarray(scores.reshape(len(scores), -1) @ correlated.T)
 
 
-def positive_part(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+def _positive_part(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
     """The part of a symmetric matrix with positive eigenvalues."""
     values, directions = np.linalg.eigh((matrix + matrix.T) / 2)
     return np.asarray((directions * np.maximum(values, 0.0)) @ directions.T)
@@ -232,7 +232,7 @@ def sandwich_covariance(
         standard_deviation = np.where(np.diag(noise) > 0, np.sqrt(np.diag(noise)), np.inf)
         correlation = power * noise / np.outer(standard_deviation, standard_deviation)
         near_correlation = np.tile(_proximity(valid), (2, 2)) * correlation
-        meat = _noise_score_covariance(scores, correlation) + positive_part(
+        meat = _noise_score_covariance(scores, correlation) + _positive_part(
             meat - _noise_score_covariance(scores, near_correlation)
         )
     estimate = bread @ meat @ bread
@@ -240,6 +240,6 @@ def sandwich_covariance(
     scale = np.sqrt(np.maximum(power * np.diag(bread) / np.diag(estimate), 1.0))
     covariance = estimate * np.outer(scale, scale)
     by_slopes = _resampled_by_slopes(system.information(), scores, system.residual, valid)
-    covariance = covariance + positive_part(by_slopes - estimate)
+    covariance = covariance + _positive_part(by_slopes - estimate)
     resampled = _resampled_covariance(system.information(), scores, system.residual, weighted.modes)
-    return np.asarray(covariance + positive_part(resampled - covariance))
+    return np.asarray(covariance + _positive_part(resampled - covariance))

@@ -102,6 +102,10 @@ def check_fit(
     significance = float(np.linalg.norm(fitted)) / weighted.noise_level(residual)
     if explained < MIN_EXPLAINED_FRACTION * signal or np.vdot(fitted, weighted.data) <= 0:
         hint = check_orientation(matrix, model, columns)
+        if hint is None and signal < MIN_EXPLAINED_FRACTION:
+            hint = (
+                "the matrix is hardly above its noise: does the mirror move, and is its light on the sensor?"
+            )
         reasons.append(
             f"the model explains {max(explained, 0.0):.0%} of the matrix where noise leaves {signal:.0%} "
             f"to explain; {hint or 'wrong layout, flip or basis, or a registration beyond capture'}"
