@@ -16,6 +16,11 @@ from escape_hw.errors import IncompatibleProduct
 from escape_hw.report.figures.matrix import representative_modes
 from escape_hw.report.tables import TITLES, Table, format_with_error
 
+#: Standard deviation of normal values relative to their median absolute deviation.
+_NORMAL_MAD = 1.4826
+#: Change of an actuator's gain, in standard deviations of the changes of all, from which on it is named.
+_OUTLYING = 6.0
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MatrixComparison:
@@ -40,6 +45,8 @@ class MatrixComparison:
     between_runs
         The same with their errors between runs of one set-up, which a change is to be compared with; empty
         unless both have them.
+    changed_actuators
+        Change of the fitted gain, B relative to A, of actuators that changed unlike the others.
     """
 
     correlation: NDArray[np.float64]
@@ -50,6 +57,7 @@ class MatrixComparison:
     elements: str
     registration: dict[str, Estimate]
     between_runs: dict[str, Estimate]
+    changed_actuators: dict[int, float]
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values for JSON."""
@@ -59,6 +67,7 @@ class MatrixComparison:
             "gain_ratio": self.gain_ratio.tolist(),
             "relative_rms": self.relative_rms.tolist(),
             "total_relative_rms": self.total_relative_rms,
+            "changed_actuators": {str(k): v for k, v in self.changed_actuators.items()},
             "median_correlation": float(np.median(self.correlation)),
             "registration_difference": {k: v.to_dict() for k, v in self.registration.items()} or None,
             "difference_between_runs": {k: v.to_dict() for k, v in self.between_runs.items()} or None,
@@ -98,7 +107,32 @@ def compare(a: CalibrationResult, b: CalibrationResult) -> MatrixComparison:
         correlation, gain, relative, total, int(both.sum()), a.grid.elements,
         _registration_difference(a, b, lambda one: one.sigma),
         _registration_difference(a, b, lambda one: one.repeatability_sigma),
+        _changed_actuators(a, b),
     )  # fmt: skip
+
+
+def _changed_actuators(a: CalibrationResult, b: CalibrationResult) -> dict[int, float]:
+    first, second = (
+        None if one.registration is None else one.registration.actuator_corrections for one in (a, b)
+    )
+    if first is None or second is None or first.gain.size != second.gain.size:
+        return {}
+    return changed_gains(first.gain, second.gain)
+
+
+def changed_gains(first: NDArray[np.float64], second: NDArray[np.float64]) -> dict[int, float]:
+    """Change of the gain of actuators, beyond the common one, where it stands out of that of the others.
+
+    Parameters
+    ----------
+    first, second
+        Relative gains of the actuators beyond the common one, of two runs ``(n_act,)``.
+    """
+    ratio = (1 + second) / (1 + first)
+    change = ratio / np.median(ratio) - 1
+    scatter = _NORMAL_MAD * float(np.median(np.abs(change)))
+    outlying = np.flatnonzero(np.abs(change) > _OUTLYING * scatter)
+    return {int(k): float(change[k]) for k in outlying[np.argsort(-np.abs(change[outlying]))]}
 
 
 def _registration_difference(
@@ -120,12 +154,14 @@ def _registration_difference(
 
 def summary_lines(result: MatrixComparison) -> list[str]:
     """The comparison in a few lines."""
+    changed = [f"{number} ({100 * change:+.0f} %)" for number, change in result.changed_actuators.items()]
     return [
         f"{result.correlation.size} modes over {result.common} common {result.elements}",
         f"correlation per mode: minimum {np.min(result.correlation):.4f}, "
         f"median {np.median(result.correlation):.4f}",
         f"gain of B relative to A: median {np.median(result.gain_ratio):.4f}",
         f"relative rms difference: {100 * result.total_relative_rms:.2f} % over the whole matrix",
+        *([f"actuators whose gain changed unlike the others': {', '.join(changed)}"] if changed else []),
     ]
 
 

@@ -66,5 +66,15 @@ def test_it_is_stored_shown_and_compared(tmp_path):
     assert "± between runs" in tables.registration_table({"": restored}).headings
     compared = comparison.compare(*results)
     assert comparison.registration_table(compared).headings[-1] == "change / σ"
+    assert not compared.changed_actuators
     change = compared.between_runs["rotation"]
     assert abs(change.value) < 4 * change.sigma < 4 * compared.registration["rotation"].sigma
+
+
+def test_an_actuator_with_another_gain_is_named():
+    first = 0.08 * np.random.default_rng(0).normal(size=37)
+    second = 1.01 * (1 + first) * (1 + 0.004 * np.random.default_rng(1).normal(size=37)) - 1
+    second[23] = 1.3 * (1 + second[23]) - 1
+    changed = comparison.changed_gains(first, second)
+    assert list(changed) == [23]
+    assert 0.27 < changed[23] < 0.33
