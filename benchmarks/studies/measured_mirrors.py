@@ -6,7 +6,7 @@
 Writes ``dm97.jsonl``, one line per date: registration, its errors and those between runs, residual, shape,
 gains of the actuators; and for successive dates the change of the registration, and what the synthetic matrix
 of the earlier one, at the registration of the later, leaves of the later measured matrix, beside what the
-earlier measured matrix leaves, and the eigenvalues of the loop with either. Then draws ``dm97.png`` and prints
+earlier measured matrix leaves, and the eigenvalues of the loop with either. Draws ``dm97.png``, prints
 the tables of the page. Takes three minutes on an idle core. Without ``--data`` the existing table is used.
 """
 

@@ -18,8 +18,9 @@ from escape_hw.report.tables import TITLES, Table, format_with_error
 
 #: Standard deviation of normal values relative to their median absolute deviation.
 _NORMAL_MAD = 1.4826
-#: Change of an actuator's gain, in standard deviations of the changes of all, from which on it is named.
-_OUTLYING = 6.0
+#: Change of an actuator's gain from which on it is named: in standard deviations of the changes of all, and
+#: relative.
+_OUTLYING, _NAMED_CHANGE = 6.0, 0.05
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -131,7 +132,7 @@ def changed_gains(first: NDArray[np.float64], second: NDArray[np.float64]) -> di
     ratio = (1 + second) / (1 + first)
     change = ratio / np.median(ratio) - 1
     scatter = _NORMAL_MAD * float(np.median(np.abs(change)))
-    outlying = np.flatnonzero(np.abs(change) > _OUTLYING * scatter)
+    outlying = np.flatnonzero(np.abs(change) > max(_OUTLYING * scatter, _NAMED_CHANGE))
     return {int(k): float(change[k]) for k in outlying[np.argsort(-np.abs(change[outlying]))]}
 
 
