@@ -2,9 +2,9 @@
 
     python benchmarks/studies/irtf_matrix.py --data ../shared/data/irtf --out docs/studies/irtf-matrix
 
-The synthetic matrix is the mean slope of the measured surfaces over each of 12 x 12 sub-apertures. SPRINT fits
-its registration to the matrices of two days, in all eight orientations of the camera, and then gains and
-positions of single actuators in the best one. Of the 2 x 2 sensor the scatter of the nine DO-CRIME matrices
+The synthetic matrix is the mean slope of the measured surfaces over each of 12 x 12 sub-apertures. SPRINT
+fits its registration to the matrices of two days, in all eight orientations of the camera, and then gains and
+positions of single actuators in the best one. Of the 2 x 2 sensor the scatter of nine DO-CRIME matrices
 of a night is compared with their mean. Writes ``irtf.json`` and ``irtf.png``. Takes half a minute.
 """
 
@@ -211,7 +211,6 @@ def draw(
     scatter.set(xlabel="element", ylabel="slope", title=f"{len(night)} DO-CRIME matrices: mean and scatter")
     for axes in (elements, gains, left, scatter):
         style.style_axes(axes)
-    figure.tight_layout()
     path.write_bytes(style.png(figure, dpi=100))
 
 

@@ -36,6 +36,8 @@ _N_MODES = 80
 _MINUTES_APART = 20
 #: Standard deviations, of repetitions, that a change needs to count as a jump.
 _JUMP = 5.0
+#: Change of an actuator's gain from which on the printed table names it.
+_NAMED_CHANGE = 0.05
 #: Coupling of the nominal mirror, and the exponential (rounding, length in pitches) of the data's README.
 _COUPLING, _ROUNDING, _LENGTH = 0.4, 0.25, 0.90
 
@@ -209,7 +211,6 @@ def draw(lines: list[dict[str, Any]], path: Path) -> None:
     loop.set(xlabel="pair of matrices", ylabel="eigenvalues of R D, 80 modes")
     for axes in (shape, changes, left, loop):
         style.style_axes(axes).legend(fontsize=7, frameon=False)
-    figure.tight_layout()
     path.write_bytes(style.png(figure, dpi=100))
 
 
@@ -225,7 +226,8 @@ def print_tables(lines: list[dict[str, Any]]) -> None:
             f"{value:+.{digits}f} ({pull:+.1f})"
             for value, pull, digits in zip(line["change"], pulls(line), (2, 2, 3, 2, 2), strict=True)
         ]
-        acts = ", ".join(f"{k} ({100 * v:+.0f} %)" for k, v in line["changed_actuators"].items())
+        changed = {k: v for k, v in line["changed_actuators"].items() if abs(v) > _NAMED_CHANGE}
+        acts = ", ".join(f"{k} ({100 * v:+.0f} %)" for k, v in changed.items())
         stamps = [
             f"{one[4:6]}-{one[6:8]} {one[8:10]}:{one[10:12]}" for one in (line["earlier"], line["date"])
         ]

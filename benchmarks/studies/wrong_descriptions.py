@@ -5,8 +5,8 @@
 
 Each row is one wrong description or one fault that the description does not mention. Writes
 ``wrong-descriptions.jsonl``: whether the fit converged, the registration relative to that of the correct
-description, in stated errors, and what it says. Without ``--data`` the twin alone is fitted. Takes some
-minutes.
+description, in stated errors, and what it says; rows that the file has are skipped. Without ``--data`` the
+twin is fitted, with it the bench. Prints the table of the page. Takes some minutes.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from realisation_tables import append_line, study_parser
+from realisation_tables import append_line, read_lines, study_parser
 
 from escape_benchmarks.measured import dm97
 from escape_hw.api.interaction_matrix import InteractionMatrix
@@ -156,11 +156,14 @@ def main() -> None:
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
     target = options.out / "wrong-descriptions.jsonl"
-    target.unlink(missing_ok=True)
-    for case in [twin_case(), *([] if options.data is None else [dm97_case(options.data)])]:
+    saved = {(row["system"], row["description"]): row for row in read_lines(target)}
+    for case in [twin_case()] if options.data is None else [dm97_case(options.data)]:
         truth: NDArray[np.float64] | None = None
         for name, (matrix, overrides, change) in descriptions(case).items():
             row: dict[str, Any] = {"system": case.name, "description": name}
+            if (case.name, name) in saved:
+                truth = np.array(saved[case.name, name]["registration"]) if truth is None else truth
+                continue
             try:
                 estimate = case.fit(matrix, overrides)
             except EscapeError as error:
@@ -175,6 +178,21 @@ def main() -> None:
                 }  # fmt: skip
             append_line(target, row)
             print(describe(row), flush=True)
+    print_table(read_lines(target))
+
+
+def print_table(rows: Sequence[dict[str, Any]]) -> None:
+    """Markdown of the saved rows: verdict, the largest error in standard errors, and what is said."""
+    print("| system | description | verdict | largest error | says |\n|---|---|---|---:|---|")
+    for row in rows:
+        verdict, pull, said = "refused", "", row.get("refused", "")
+        if "error" in row:
+            said = " / ".join((row["warnings"] or row["notes"])[:2])
+            if row["converged"]:
+                verdict, errors = "converged", np.divide(row["error"], row["sigma"])
+                k = int(np.argmax(np.abs(errors)))
+                pull = f"{PARAMETERS[k].replace('_', ' ')} {row['error'][k]:+.2f} ({errors[k]:+.1f} σ)"
+        print(f"| {row['system']} | {row['description']} | {verdict} | {pull} | {said} |")
 
 
 def describe(row: dict[str, Any]) -> str:

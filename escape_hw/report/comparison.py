@@ -18,8 +18,8 @@ from escape_hw.report.tables import TITLES, Table, format_with_error
 
 #: Standard deviation of normal values relative to their median absolute deviation.
 _NORMAL_MAD = 1.4826
-#: Change of an actuator's gain from which on it is named: in standard deviations of the changes of all, and
-#: relative.
+#: Change of an actuator's gain, in standard deviations of the changes of all, from which on it is not chance;
+#: and relative, from which on it is named.
 _OUTLYING, _NAMED_CHANGE = 6.0, 0.05
 
 
@@ -47,7 +47,8 @@ class MatrixComparison:
         The same with their errors between runs of one set-up, which a change is to be compared with; empty
         unless both have them.
     changed_actuators
-        Change of the fitted gain, B relative to A, of actuators that changed unlike the others.
+        Change of the fitted gain, B relative to A, of actuators that changed unlike the others, by 5 % at
+        least.
     """
 
     correlation: NDArray[np.float64]
@@ -118,7 +119,8 @@ def _changed_actuators(a: CalibrationResult, b: CalibrationResult) -> dict[int, 
     )
     if first is None or second is None or first.gain.size != second.gain.size:
         return {}
-    return changed_gains(first.gain, second.gain)
+    changed = changed_gains(first.gain, second.gain)
+    return {number: change for number, change in changed.items() if abs(change) > _NAMED_CHANGE}
 
 
 def changed_gains(first: NDArray[np.float64], second: NDArray[np.float64]) -> dict[int, float]:
@@ -132,7 +134,7 @@ def changed_gains(first: NDArray[np.float64], second: NDArray[np.float64]) -> di
     ratio = (1 + second) / (1 + first)
     change = ratio / np.median(ratio) - 1
     scatter = _NORMAL_MAD * float(np.median(np.abs(change)))
-    outlying = np.flatnonzero(np.abs(change) > max(_OUTLYING * scatter, _NAMED_CHANGE))
+    outlying = np.flatnonzero(np.abs(change) > _OUTLYING * scatter)
     return {int(k): float(change[k]) for k in outlying[np.argsort(-np.abs(change[outlying]))]}
 
 

@@ -22,8 +22,9 @@ _HARDLY_RESPONDS = -0.5
 #: Scalings in % of the same sign, and difference between the gains of x and y slopes, from which on they are
 #: named. They are correct results, so this limits what is displayed and nothing else.
 _NAMED_SCALING, _NAMED_STRETCH = 3.0, 0.02
-#: Clocking in its standard errors from which on it is named and its effect added to the errors.
-_SIGNIFICANT = 5.0
+#: Clocking, in its standard errors, from which on its effect is added to the errors of the registration, and
+#: from which on it is named; gains of x and y slopes differ from as many standard errors on.
+_LIKELY, _SIGNIFICANT = 2.0, 3.0
 _MAX_NAMED = 8
 
 
@@ -62,8 +63,8 @@ def describe_description(
         error = float(np.sqrt(lit.var(axis=1).sum() / lit.shape[1]))
         if abs(stretch) > max(_NAMED_STRETCH, _SIGNIFICANT * error):
             notes.append(
-                f"the x slopes are {100 * stretch:+.1f} % larger than the y slopes, relative to the model; "
-                "are the pixels or the image stretched?"
+                f"the x slopes are {abs(100 * stretch):.1f} % {'larger' if stretch > 0 else 'smaller'} than "
+                "the y slopes, relative to the model; are the pixels or the image stretched?"
             )
     return notes
 
@@ -73,8 +74,9 @@ def _scaling_notes(registration: Registration) -> list[str]:
     if abs(scalings.sum()) != np.abs(scalings).sum() or np.abs(scalings).min() < _NAMED_SCALING:
         return []
     return [
-        f"the mirror is {scalings.mean():+.1f} % larger on the sensor than described: check the pitch of the "
-        "actuators and the number and size of the sub-apertures, or correct devices.dm.pitches_across_pupil"
+        f"the mirror is {abs(scalings.mean()):.1f} % {'larger' if scalings.mean() > 0 else 'smaller'} on the "
+        "sensor than described: check the pitch of the actuators and the number and size of the "
+        "sub-apertures, or correct devices.dm.pitches_across_pupil"
     ]
 
 
@@ -100,12 +102,15 @@ class Clocking:
     bias: NDArray[np.float64]
 
     @property
-    def is_significant(self) -> bool:
-        """Whether the angle cannot be chance."""
-        return abs(self.angle_deg) > _SIGNIFICANT * self.sigma_deg
+    def covariance(self) -> NDArray[np.float64]:
+        """What to add to that of the registration ``(5, 5)``: zero where the angle may be chance."""
+        is_likely = abs(self.angle_deg) > _LIKELY * self.sigma_deg
+        return np.outer(self.bias, self.bias) * is_likely
 
-    def describe(self) -> str:
-        """A sentence for the operator."""
+    def describe(self) -> str | None:
+        """A sentence for the operator; ``None`` where the angle may be chance."""
+        if abs(self.angle_deg) < _SIGNIFICANT * self.sigma_deg:
+            return None
         return (
             f"the slopes are turned by {self.angle_deg:.2f} ± {self.sigma_deg:.2f} degrees against the grid "
             "of sub-apertures: the camera is clocked against the lenslets or the pyramid; the errors of the "
@@ -118,7 +123,7 @@ def estimate_clocking(weighted: WeightedMatrix, system: NormalEquations) -> Cloc
 
     One Gauss-Newton step of the fit extended by the angle. Its standard error is the larger one of those
     from the noise and from the scatter of the scores over columns and sub-apertures, which contains the
-    misfit of the model.
+    misfit of the model (clusters two ways; Cameron, Gelbach & Miller 2011).
     """
     x, y = np.split(system.model, 2)
     by_slope = weighted.by_slope[:, None]
@@ -142,7 +147,7 @@ def estimate_clocking(weighted: WeightedMatrix, system: NormalEquations) -> Cloc
     projected = turned - _modelled(system, inner, of_gains)
     score = projected * (system.residual - angle * projected)
     by_column, by_sub_aperture = score.sum(axis=0), score.sum(axis=1).reshape(2, -1).sum(axis=0)
-    scatter = np.square(by_column).sum() + np.square(by_sub_aperture).sum()
+    scatter = np.square(by_column).sum() + np.square(by_sub_aperture).sum() - np.square(score).sum()
     noise = weighted.noise_level(system.residual) ** 2 * information
     sigma = float(np.sqrt(max(scatter, noise))) / information
     return Clocking(float(np.rad2deg(angle)), float(np.rad2deg(sigma)), np.asarray(inner[1:6] * angle))

@@ -393,9 +393,9 @@ def _build_estimate(
     covariance[np.arange(1, 6), np.arange(1, 6)] += np.square(model_sigma)
     if isinstance(solution.system, NormalEquations):
         clocking = estimate_clocking(weighted, solution.system)
-        if clocking.is_significant:
-            covariance[1:6, 1:6] += np.outer(clocking.bias, clocking.bias)
-            notes += (clocking.describe(),)
+        covariance[1:6, 1:6] += clocking.covariance
+        remark = clocking.describe()
+        notes += () if remark is None else (remark,)
     sigma = np.sqrt(np.diag(covariance))
     between_runs = repeatability_covariance(weighted, solution.system, noise, context.model)
     # The registration of a run repeats at least as well as it is known.
