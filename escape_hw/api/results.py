@@ -117,6 +117,9 @@ class RegistrationEstimate:
         Estimates of the extra parameters by name.
     influence_profile
         Fitted profile of the influence functions; ``None`` if it was not fitted.
+    repeatability_covariance
+        Covariance of the registration between runs of one set-up ``(5, 5)``: the part of ``covariance`` that
+        does not drop out of their differences. ``None`` if it was not estimated.
     """
 
     registration: Registration
@@ -131,11 +134,18 @@ class RegistrationEstimate:
     actuator_corrections: ActuatorCorrections | None = None
     extras: Mapping[str, Estimate] = field(default_factory=dict)
     influence_profile: InfluenceProfile | None = None
+    repeatability_covariance: NDArray[np.float64] | None = None
 
     @property
     def sigma(self) -> NDArray[np.float64]:
         """Standard errors ``(5,)`` in the order of ``PARAMETERS``."""
         return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def repeatability_sigma(self) -> NDArray[np.float64] | None:
+        """Standard errors between runs of one set-up ``(5,)``; ``None`` if they were not estimated."""
+        covariance = self.repeatability_covariance
+        return None if covariance is None else np.sqrt(np.diag(covariance))
 
     def parameters(self) -> dict[str, Estimate]:
         """Every parameter with its standard error and unit."""

@@ -68,8 +68,12 @@ def registration_document(estimate: RegistrationEstimate | None) -> dict[str, An
     """What SPRINT found; all ``None`` when it did not run."""
     if estimate is None:
         return {"registration": None, "gain": None, "gain_sigma": None, "iterations": None, "converged": None}
+    between_runs = estimate.repeatability_sigma
     return {
         "registration": {name: value.to_dict() for name, value in estimate.parameters().items()},
+        "repeatability_sigma": (
+            None if between_runs is None else dict(zip(PARAMETERS, between_runs.tolist(), strict=True))
+        ),
         "gain": estimate.gain.value,
         "gain_sigma": estimate.gain.sigma,
         "width": estimate.width.to_dict(),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,10 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from escape_hw.api.registration import PARAMETERS, UNITS
-from escape_hw.api.results import CalibrationResult, Estimate
+from escape_hw.api.results import CalibrationResult, Estimate, RegistrationEstimate
 from escape_hw.errors import IncompatibleProduct
 from escape_hw.report.figures.matrix import representative_modes
 from escape_hw.report.tables import TITLES, Table, format_with_error
+
+#: Standard deviation of normal values relative to their median absolute deviation.
+_NORMAL_MAD = 1.4826
+#: Change of an actuator's gain, in standard deviations of the changes of all, from which on it is not chance;
+#: and relative, from which on it is named.
+_OUTLYING, _NAMED_CHANGE = 6.0, 0.05
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,6 +43,12 @@ class MatrixComparison:
         What they are called.
     registration
         B minus A with combined standard errors; empty unless both have one.
+    between_runs
+        The same with their errors between runs of one set-up, which a change is to be compared with; empty
+        unless both have them.
+    changed_actuators
+        Change of the fitted gain, B relative to A, of actuators that changed unlike the others, by 5 % at
+        least.
     """
 
     correlation: NDArray[np.float64]
@@ -45,6 +58,8 @@ class MatrixComparison:
     common: int
     elements: str
     registration: dict[str, Estimate]
+    between_runs: dict[str, Estimate]
+    changed_actuators: dict[int, float]
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values for JSON."""
@@ -54,8 +69,10 @@ class MatrixComparison:
             "gain_ratio": self.gain_ratio.tolist(),
             "relative_rms": self.relative_rms.tolist(),
             "total_relative_rms": self.total_relative_rms,
+            "changed_actuators": {str(k): v for k, v in self.changed_actuators.items()},
             "median_correlation": float(np.median(self.correlation)),
             "registration_difference": {k: v.to_dict() for k, v in self.registration.items()} or None,
+            "difference_between_runs": {k: v.to_dict() for k, v in self.between_runs.items()} or None,
         }
 
 
@@ -89,32 +106,65 @@ def compare(a: CalibrationResult, b: CalibrationResult) -> MatrixComparison:
         relative = np.sqrt(np.sum((right - left) ** 2, axis=0) / power_left)
     total = math.sqrt(float(np.sum((right - left) ** 2)) / max(float(power_left.sum()), 1e-300))
     return MatrixComparison(
-        correlation, gain, relative, total, int(both.sum()), a.grid.elements, _registration_difference(a, b)
+        correlation, gain, relative, total, int(both.sum()), a.grid.elements,
+        _registration_difference(a, b, lambda one: one.sigma),
+        _registration_difference(a, b, lambda one: one.repeatability_sigma),
+        _changed_actuators(a, b),
+    )  # fmt: skip
+
+
+def _changed_actuators(a: CalibrationResult, b: CalibrationResult) -> dict[int, float]:
+    first, second = (
+        None if one.registration is None else one.registration.actuator_corrections for one in (a, b)
     )
+    if first is None or second is None or first.gain.size != second.gain.size:
+        return {}
+    changed = changed_gains(first.gain, second.gain)
+    return {number: change for number, change in changed.items() if abs(change) > _NAMED_CHANGE}
 
 
-def _registration_difference(a: CalibrationResult, b: CalibrationResult) -> dict[str, Estimate]:
+def changed_gains(first: NDArray[np.float64], second: NDArray[np.float64]) -> dict[int, float]:
+    """Change of the gain of actuators, beyond the common one, where it stands out of that of the others.
+
+    Parameters
+    ----------
+    first, second
+        Relative gains of the actuators beyond the common one, of two runs ``(n_act,)``.
+    """
+    ratio = (1 + second) / (1 + first)
+    change = ratio / np.median(ratio) - 1
+    scatter = _NORMAL_MAD * float(np.median(np.abs(change)))
+    outlying = np.flatnonzero(np.abs(change) > _OUTLYING * scatter)
+    return {int(k): float(change[k]) for k in outlying[np.argsort(-np.abs(change[outlying]))]}
+
+
+def _registration_difference(
+    a: CalibrationResult,
+    b: CalibrationResult,
+    errors_of: Callable[[RegistrationEstimate], NDArray[np.float64] | None],
+) -> dict[str, Estimate]:
     if a.registration is None or b.registration is None:
         return {}
-    first, second = a.registration.parameters(), b.registration.parameters()
+    first, second = errors_of(a.registration), errors_of(b.registration)
+    if first is None or second is None:
+        return {}
+    change = b.registration.registration.to_array() - a.registration.registration.to_array()
     return {
-        name: Estimate(
-            second[name].value - first[name].value,
-            math.hypot(first[name].sigma, second[name].sigma),
-            UNITS[name],
-        )
-        for name in PARAMETERS
+        name: Estimate(float(value), float(sigma), UNITS[name])
+        for name, value, sigma in zip(PARAMETERS, change, np.hypot(first, second), strict=True)
     }
 
 
 def summary_lines(result: MatrixComparison) -> list[str]:
     """The comparison in a few lines."""
+    changed = [f"{number} ({100 * change:+.0f} %)" for number, change in result.changed_actuators.items()]
     return [
         f"{result.correlation.size} modes over {result.common} common {result.elements}",
         f"correlation per mode: minimum {np.min(result.correlation):.4f}, "
         f"median {np.median(result.correlation):.4f}",
         f"gain of B relative to A: median {np.median(result.gain_ratio):.4f}",
         f"relative rms difference: {100 * result.total_relative_rms:.2f} % over the whole matrix",
+        *([f"actuators whose gain changed unlike the others': {', '.join(changed)}"] if changed else []),
     ]
 
 
@@ -133,9 +183,14 @@ def mode_table(result: MatrixComparison, count: int = 12) -> Table:
 
 
 def registration_table(result: MatrixComparison) -> Table:
-    """Difference of the registrations with combined errors."""
-    rows = tuple(
-        (f"{TITLES[name][0]} [{TITLES[name][1]}]", format_with_error(value))
-        for name, value in result.registration.items()
-    )
-    return Table(("Component", "α(B) − α(A)"), rows)
+    """Difference of the registrations with combined errors, and its significance as a change between runs."""
+    rows = []
+    for name, value in result.registration.items():
+        row = [f"{TITLES[name][0]} [{TITLES[name][1]}]", format_with_error(value)]
+        between = result.between_runs.get(name)
+        if between is not None:
+            significance = f"{between.value / between.sigma:+.1f}" if between.sigma > 0 else "–"
+            row += [f"{between.sigma:.2g}", significance.replace("-", "−")]
+        rows.append(tuple(row))
+    headings = ("± between runs", "change / σ") if result.between_runs else ()
+    return Table(("Component", "α(B) − α(A)", *headings), tuple(rows))

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from escape_hw.api.optical_gains import GainsResult
-from escape_hw.api.registration import Registration
+from escape_hw.api.registration import PARAMETERS, Registration
 from escape_hw.api.results import Estimate, LoopResult, RegistrationEstimate
 
 #: Labels of methods in figures, tables and lists, in the order of lists: matrices measured with a calibration
@@ -82,16 +82,27 @@ def registration_table(
         True values of a twin, shown in the last column; a column after each estimate then gives its
         error in standard errors.
     """
-    return parameters_table({k: {**one.parameters(), **one.extras} for k, one in estimates.items()}, injected)
+    parameters = {k: {**one.parameters(), **one.extras} for k, one in estimates.items()}
+    sigmas = {label: one.repeatability_sigma for label, one in estimates.items()}
+    between_runs = {
+        label: dict(zip(PARAMETERS, sigma.tolist(), strict=True))
+        for label, sigma in sigmas.items()
+        if sigma is not None
+    }
+    return parameters_table(parameters, injected, between_runs)
 
 
 def parameters_table(
-    estimates: Mapping[str, Mapping[str, Estimate]], injected: Registration | None = None
+    estimates: Mapping[str, Mapping[str, Estimate]],
+    injected: Registration | None = None,
+    between_runs: Mapping[str, Mapping[str, float]] | None = None,
 ) -> Table:
-    """As :func:`registration_table`, of parameters by name with their errors."""
-    headings = ["Component"]
+    """As :func:`registration_table`, of parameters by name with their errors, and those between runs."""
+    headings, between = ["Component"], between_runs or {}
     for label in estimates:
         headings.append(f"α {label}".strip())
+        if label in between:
+            headings.append("± between runs")
         if injected is not None:
             headings.append("Δ / σ")
     if injected is not None:
@@ -104,9 +115,11 @@ def parameters_table(
     for name in (name for name in TITLES if any(name in estimate for estimate in estimates.values())):
         title, unit = TITLES[name]
         row = [f"{title} [{unit}]"]
-        for estimate in estimates.values():
+        for label, estimate in estimates.items():
             value = estimate.get(name)
             row.append("–" if value is None else format_with_error(value))
+            if label in between:
+                row.append(f"{between[label][name]:.2g}" if name in between[label] else "–")
             if injected is not None:
                 row.append("–" if value is None or name not in truth else _format_pull(value, truth[name]))
         if injected is not None:

@@ -16,6 +16,7 @@ from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.calibration.sprint.fit import SprintFit
 from escape_hw.config.loader import load_system
 from escape_hw.io.interchange.arrays import import_arrays, read_description
+from escape_hw.report.comparison import changed_gains
 from escape_hw.runtime.session.array_target import array_target
 
 FOLDER = SHARED / "dm97"
@@ -54,6 +55,13 @@ def test_matrices_minutes_apart_agree() -> None:
     difference = a.estimate.registration.to_array() - b.estimate.registration.to_array()
     # In % of a sub-aperture, degrees and % of the diameter: less than the uncertainty of the registration.
     assert (np.abs(difference) < [1.0, 1.0, 0.02, 0.15, 0.15]).all()
+    # Between runs of one set-up it is known ten times better, and they agree within that.
+    between = [one.estimate.repeatability_sigma for one in (a, b)]
+    assert between[0] is not None
+    assert between[1] is not None
+    assert (between[0] < 0.4 * a.estimate.sigma).all()
+    chi2 = np.square(difference / np.hypot(*between)).mean()
+    assert 0.1 < chi2 < 2.0, difference / np.hypot(*between)
     left = np.linalg.norm(second.data - a.zonal_matrix()) / np.linalg.norm(second.data)
     assert left < 0.08
 
@@ -68,6 +76,14 @@ def test_broken_lenslets_are_named() -> None:
 def test_a_mirror_that_did_not_move_is_refused() -> None:
     estimate = fitted("20231214125445")[1].estimate
     assert not estimate.converged, estimate
+    assert "does the mirror move" in estimate.warnings[0]
+
+
+def test_an_actuator_whose_gain_changes_is_named() -> None:
+    gains = [
+        fitted(date)[1].estimate.actuator_corrections.gain for date in ("20230927150437", "20230927151155")
+    ]
+    assert next(iter(changed_gains(*gains))) == 23
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from escape_hw.calibration.sprint.goodness_of_fit import describe_misfit, misfit_fraction
+from escape_hw.calibration.sprint.goodness_of_fit import describe_misfit, describe_outliers, misfit_fraction
 from escape_hw.calibration.sprint.weighted_matrix import WeightedMatrix
 
 VALID = np.ones((6, 6), dtype=bool)
@@ -36,6 +36,6 @@ def test_the_worst_parts_are_named():
     residual = rng.standard_normal(weighted.data.shape)
     residual[[7, 36 + 7]] += 40 * rng.standard_normal((2, N_MODES))
     residual[:, 3] += 20 * rng.standard_normal(72)
-    (note,) = describe_misfit(weighted, residual)
-    assert "sub-apertures (row, column) (1, 1)" in note
-    assert "actuators 3" in note
+    named = describe_outliers(weighted, residual)
+    assert "sub-apertures (row, column) (1, 1)" in named
+    assert "actuators 3" in named

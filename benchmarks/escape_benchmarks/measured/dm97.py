@@ -7,6 +7,7 @@ slopes have no tip and tilt; the largest mask reaches beyond the 29 x 29 lenslet
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -73,9 +74,14 @@ def make_model(matrix: InteractionMatrix) -> SyntheticModel:
     return make_fast_model(_system(), require_kind(grid, SubApertureGrid))
 
 
+def load_design(overrides: Sequence[str] = ()) -> SystemConfig:
+    """The bench's configuration, with further overrides."""
+    return load_system("razor-shwfs", overrides=(*_DESIGN, *overrides))
+
+
 @cache
 def _system() -> SystemConfig:
-    return load_system("razor-shwfs", overrides=_DESIGN)
+    return load_design()
 
 
 def fit_matrix(matrix: InteractionMatrix) -> SprintFit:

@@ -242,9 +242,11 @@ def sandwich_covariance(
             meat - _noise_score_covariance(scores, near_correlation)
         )
     estimate = bread @ meat @ bread
-    # Not smaller than the errors due to noise alone.
-    scale = np.sqrt(np.maximum(power * np.diag(bread) / np.diag(estimate), 1.0))
-    covariance = estimate * np.outer(scale, scale)
+    # Not smaller than the errors due to noise alone; a parameter that moves no slope has those of its prior.
+    least, scatter = power * np.diag(bread), np.diag(estimate)
+    moves = scatter > 0
+    scale = np.sqrt(np.maximum(np.divide(least, scatter, out=np.ones_like(least), where=moves), 1.0))
+    covariance = estimate * np.outer(scale, scale) + np.diag(np.where(moves, 0.0, least))
     by_slopes = _resampled_by_slopes(system.information(), scores, system.residual, valid)
     covariance = covariance + _positive_part(by_slopes - estimate)
     resampled = _resampled_covariance(system.information(), scores, system.residual, weighted.modes)

@@ -21,13 +21,15 @@ from escape_hw.api.results import Estimate, RegistrationEstimate
 from escape_hw.api.synthetic_model import SyntheticModel
 from escape_hw.calibration.modes.derivatives import modal_matrix
 from escape_hw.calibration.sprint.covariance import sandwich_covariance, systematic_error
+from escape_hw.calibration.sprint.description_checks import describe_description, estimate_clocking
 from escape_hw.calibration.sprint.diagnostics import describe_degeneracies
 from escape_hw.calibration.sprint.extra_parameters import build_extra_parameters
 from escape_hw.calibration.sprint.goodness_of_fit import check_fit, describe_misfit
 from escape_hw.calibration.sprint.influence_estimate import estimate_profile
 from escape_hw.calibration.sprint.mixed_effects import GAIN, SHAPE, WIDTH, MixedEffectsState, PriorEstimate
 from escape_hw.calibration.sprint.mode_choice import choose_modes
-from escape_hw.calibration.sprint.normal_equations import Priors
+from escape_hw.calibration.sprint.normal_equations import NormalEquations, Priors
+from escape_hw.calibration.sprint.repeatability import repeatability_covariance
 from escape_hw.calibration.sprint.solvers import MAX_STEP, SolverContext, SprintSolution, solve
 from escape_hw.calibration.sprint.tip_tilt import TipTiltFreeModel, is_tip_tilt_removed
 from escape_hw.calibration.sprint.weighted_matrix import (
@@ -391,8 +393,20 @@ def _build_estimate(
         covariance[1:6, 1:6] += solution.added_covariance
     model_sigma = systematic_error(context.model)
     covariance[np.arange(1, 6), np.arange(1, 6)] += np.square(model_sigma)
+    if isinstance(solution.system, NormalEquations):
+        clocking = estimate_clocking(weighted, solution.system)
+        covariance[1:6, 1:6] += clocking.covariance
+        remark = clocking.describe()
+        notes += () if remark is None else (remark,)
     sigma = np.sqrt(np.diag(covariance))
+    between_runs = repeatability_covariance(weighted, solution.system, noise, context.model)
+    # The registration of a run repeats at least as well as it is known.
+    share = np.minimum(1.0, sigma[1:6] / np.sqrt(np.diag(between_runs)))
     warnings = check_convergence(context, weighted, solution, sigma[1:6])
+    if not warnings:
+        registration = Registration.from_array(solution.alpha)
+        residual = solution.system.residual
+        notes += tuple(describe_description(weighted, residual, registration, solution.state))
     return RegistrationEstimate(
         Registration.from_array(solution.alpha),
         covariance[1:6, 1:6],
@@ -405,6 +419,7 @@ def _build_estimate(
         notes,
         extras={one.model.name: one.to_estimate(sigma, model_sigma) for one in solution.extras},
         **_fitted_mirror(context, solution, covariance),
+        repeatability_covariance=between_runs * np.outer(share, share),
     )
 
 

@@ -33,7 +33,6 @@ _MAX_SCALING, _MAX_ROTATION = 20.0, 30.0
 #: A sub-aperture or actuator whose rms residual exceeds the median one by this factor is named, so many at
 #: most.
 _OUTLIER, _MAX_NAMED = 3.0, 12
-_EVEN = "no part stands out"
 
 
 def misfit_fraction(weighted: WeightedMatrix, residual: NDArray[np.float64]) -> float:
@@ -58,7 +57,7 @@ def misfit_fraction(weighted: WeightedMatrix, residual: NDArray[np.float64]) -> 
 
 
 def describe_misfit(weighted: WeightedMatrix, residual: NDArray[np.float64]) -> tuple[str, ...]:
-    """A note that the model does not fit to within the noise, with what fits worst; empty if it does.
+    """A note that the model does not fit to within the noise; empty if it does.
 
     Parameters
     ----------
@@ -68,11 +67,10 @@ def describe_misfit(weighted: WeightedMatrix, residual: NDArray[np.float64]) -> 
     misfit = misfit_fraction(weighted, residual) if weighted.has_standard_errors else 0.0
     if not _NOTABLE_MISFIT < misfit <= _MAX_MISFIT:
         return ()
-    outliers = describe_outliers(weighted, residual)
     return (
         f"the model does not fit to within the noise: {misfit:.0%} of the matrix remain beyond it (reduced "
         f"chi-squared {np.mean(np.square(residual)):.3g}), which the standard errors include as far as "
-        f"leaving out parts of the matrix shows it; {f'worst: {outliers}' if outliers else _EVEN}",
+        "leaving out parts of the matrix shows it",
     )
 
 
@@ -124,6 +122,10 @@ def check_fit(
     significance = float(np.linalg.norm(fitted)) / weighted.noise_level(residual)
     if explained < MIN_EXPLAINED_FRACTION * signal or np.vdot(fitted, weighted.data) <= 0:
         hint = check_orientation(matrix, model, columns)
+        if hint is None and signal < MIN_EXPLAINED_FRACTION:
+            hint = (
+                "the matrix is hardly above its noise: does the mirror move, and is its light on the sensor?"
+            )
         reasons.append(
             f"the model explains {max(explained, 0.0):.0%} of the matrix where noise leaves {signal:.0%} "
             f"to explain; {hint or 'wrong layout, flip or basis, or a registration beyond capture'}"
@@ -140,7 +142,7 @@ def check_fit(
         )
     elif misfit > _MAX_MISFIT:
         outliers = describe_outliers(weighted, residual)
-        where = f"worst: {outliers}" if outliers else _EVEN
+        where = f"worst: {outliers}" if outliers else "no part stands out"
         reasons.append(
             f"the model does not fit: {misfit:.0%} of the matrix remain beyond its noise (reduced "
             f"chi-squared {np.mean(np.square(residual)):.3g}); {where}"

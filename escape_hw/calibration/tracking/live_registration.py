@@ -285,6 +285,7 @@ class LiveRegistration:
                 one.model.name: one.to_estimate(sigma, systematic_error(self._model))
                 for one in problem.extra_parameter_values(state)
             },
+            repeatability_covariance=present.random_covariance[1:6, 1:6],
         )
         unit = compute_fitted_matrix(self._model, self._start, estimate, self._template.m2c)
         gains = np.asarray((self._current_matrix * unit).sum(axis=0) / np.square(unit).sum(axis=0))

@@ -191,6 +191,7 @@ def pack_registration(estimate: RegistrationEstimate) -> list[Any]:
             "CHI2": np.array([step.chi2 for step in steps], float),
         },
     )
+    between_runs = estimate.repeatability_covariance
     notes = {
         "chi2": float(estimate.chi2),
         "warnings": list(estimate.warnings),
@@ -201,6 +202,7 @@ def pack_registration(estimate: RegistrationEstimate) -> list[Any]:
         fits_file.image_extension("COVAR", np.asarray(estimate.covariance, np.float64)),
         iterations,
         pack_metrics(notes, "ALPHANOT"),
+        *([] if between_runs is None else [fits_file.image_extension("REPEATCO", between_runs)]),
         *([] if estimate.actuator_corrections is None else _pack_actuators(estimate.actuator_corrections)),
         *([] if estimate.influence_profile is None else [pack_profile(estimate.influence_profile)]),
     ]
@@ -315,6 +317,9 @@ def unpack_registration(path: Path, hdus: fits.HDUList) -> RegistrationEstimate 
         },
         actuator_corrections=_unpack_actuators(path, hdus),
         influence_profile=unpack_profile(hdus),
+        repeatability_covariance=(
+            fits_file.read_array(path, hdus, "REPEATCO", np.float64) if "REPEATCO" in hdus else None
+        ),
     )
 
 

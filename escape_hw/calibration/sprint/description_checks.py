@@ -1,0 +1,170 @@
+"""What a converged fit says of the description: parts that do not respond, wrong scales, clocking.
+
+A fit may converge although the description is wrong, because registration and random effects absorb the
+difference. Each check names what they absorbed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from escape_hw.api.registration import Registration
+from escape_hw.calibration.sprint.goodness_of_fit import describe_outliers
+from escape_hw.calibration.sprint.mixed_effects import MixedEffectsState
+from escape_hw.calibration.sprint.normal_equations import NormalEquations
+from escape_hw.calibration.sprint.weighted_matrix import WeightedMatrix
+
+#: Relative gain beyond the common one below which an actuator or sub-aperture is named: half of the others.
+_HARDLY_RESPONDS = -0.5
+#: Scalings in % of the same sign, and difference between the gains of x and y slopes, from which on they are
+#: named. They are correct results, so this limits what is displayed and nothing else.
+_NAMED_SCALING, _NAMED_STRETCH = 3.0, 0.02
+#: Clocking, in its standard errors, from which on its effect is added to the errors of the registration, and
+#: from which on it is named; gains of x and y slopes differ from as many standard errors on.
+_LIKELY, _SIGNIFICANT = 2.0, 3.0
+_MAX_NAMED = 8
+
+
+def describe_description(
+    weighted: WeightedMatrix,
+    residual: NDArray[np.float64],
+    registration: Registration,
+    state: MixedEffectsState | None,
+) -> list[str]:
+    """Remarks on what registration and random effects absorbed; none if nothing is remarkable."""
+    notes, outliers = _scaling_notes(registration), describe_outliers(weighted, residual)
+    if outliers:
+        notes.append(
+            f"the largest residuals are those of {outliers}; calibration.loss = 'huber' tolerates them"
+        )
+    if state is None:
+        return notes
+    weak = np.flatnonzero(state.actuator_gain < _HARDLY_RESPONDS)
+    if weak.size:
+        notes.append(
+            f"actuators that hardly respond: {_list([str(a) for a in weak])}; check the mirror, the cables "
+            "and the numbering"
+        )
+    by_axis = state.slope_gain.reshape(2, -1)
+    rows, columns = np.nonzero(weighted.valid)
+    dark = np.flatnonzero(by_axis.max(axis=0) < _HARDLY_RESPONDS)
+    if dark.size:
+        places = [f"({rows[k]}, {columns[k]})" for k in dark.tolist()]
+        notes.append(
+            f"{dark.size} of {rows.size} sub-apertures hardly respond, (row, column) {_list(places)}; are "
+            "they lit?"
+        )
+    lit = by_axis[:, by_axis.max(axis=0) >= _HARDLY_RESPONDS]
+    if lit.shape[1] > 1:
+        stretch = float(lit[0].mean() - lit[1].mean())
+        error = float(np.sqrt(lit.var(axis=1).sum() / lit.shape[1]))
+        if abs(stretch) > max(_NAMED_STRETCH, _SIGNIFICANT * error):
+            notes.append(
+                f"the x slopes are {abs(100 * stretch):.1f} % {'larger' if stretch > 0 else 'smaller'} than "
+                "the y slopes, relative to the model; are the pixels or the image stretched?"
+            )
+    return notes
+
+
+def _scaling_notes(registration: Registration) -> list[str]:
+    scalings = np.array([registration.radial_scaling, registration.tangential_scaling])
+    if abs(scalings.sum()) != np.abs(scalings).sum() or np.abs(scalings).min() < _NAMED_SCALING:
+        return []
+    return [
+        f"the mirror is {abs(scalings.mean()):.1f} % {'larger' if scalings.mean() > 0 else 'smaller'} on the "
+        "sensor than described: check the pitch of the actuators and the number and size of the "
+        "sub-apertures, or correct devices.dm.pitches_across_pupil"
+    ]
+
+
+def _list(names: list[str]) -> str:
+    more = f" and {len(names) - _MAX_NAMED} more" if len(names) > _MAX_NAMED else ""
+    return ", ".join(names[:_MAX_NAMED]) + more
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Clocking:
+    """Rotation of the camera against the grid of sub-apertures.
+
+    Parameters
+    ----------
+    angle_deg, sigma_deg
+        Angle by which all slopes are turned, from +x towards +y, and its standard error.
+    bias
+        What it does to the registration that is fitted without it ``(5,)``.
+    """
+
+    angle_deg: float
+    sigma_deg: float
+    bias: NDArray[np.float64]
+
+    @property
+    def covariance(self) -> NDArray[np.float64]:
+        """What to add to that of the registration ``(5, 5)``: zero where the angle may be chance."""
+        is_likely = abs(self.angle_deg) > _LIKELY * self.sigma_deg
+        return np.outer(self.bias, self.bias) * is_likely
+
+    def describe(self) -> str | None:
+        """A sentence for the operator; ``None`` where the angle may be chance."""
+        if abs(self.angle_deg) < _SIGNIFICANT * self.sigma_deg:
+            return None
+        return (
+            f"the slopes are turned by {self.angle_deg:.2f} ± {self.sigma_deg:.2f} degrees against the grid "
+            "of sub-apertures: the camera is clocked against the lenslets or the pyramid; the errors of the "
+            "registration include what this does to it"
+        )
+
+
+def estimate_clocking(weighted: WeightedMatrix, system: NormalEquations) -> Clocking:
+    """Estimate the angle from the residual of a fit without it, all other unknowns adjusted.
+
+    One Gauss-Newton step of the fit extended by the angle. Its standard error is the larger one of those
+    from the noise and from the scatter of the scores over columns and sub-apertures, which contains the
+    misfit of the model (clusters two ways; Cameron, Gelbach & Miller 2011).
+    """
+    x, y = np.split(system.model, 2)
+    by_slope = weighted.by_slope[:, None]
+    half = len(x)
+    turned = np.concatenate([-y * by_slope[half:] / by_slope[:half], x * by_slope[:half] / by_slope[half:]])
+    commands = turned @ system.modes.T
+    member = (system.lines[:, None] == np.arange(system.lines.max() + 1)).astype(float)
+    of_gains = (system.model * turned).sum(axis=1)
+    products = [
+        system.common.reshape(system.n_common, -1) @ turned.ravel(),
+        (turned * system.sampling_derivative).sum(axis=1) @ member,
+        of_gains @ system.trends,
+        *(np.einsum("sa,sa->a", z, commands) for z in system.actuator_derivatives),
+    ]
+    coupled = np.concatenate(products) - system.coupling.T @ (of_gains / system.diagonal)
+    inner = np.linalg.solve(system.schur_complement, coupled)
+    information = float(
+        np.square(turned).sum() - np.square(of_gains) @ (1 / system.diagonal) - coupled @ inner
+    )
+    angle = float((turned * system.residual).sum()) / information
+    projected = turned - _modelled(system, inner, of_gains)
+    score = projected * (system.residual - angle * projected)
+    by_column, by_sub_aperture = score.sum(axis=0), score.sum(axis=1).reshape(2, -1).sum(axis=0)
+    scatter = np.square(by_column).sum() + np.square(by_sub_aperture).sum() - np.square(score).sum()
+    noise = weighted.noise_level(system.residual) ** 2 * information
+    sigma = float(np.sqrt(max(scatter, noise))) / information
+    return Clocking(float(np.rad2deg(angle)), float(np.rad2deg(sigma)), np.asarray(inner[1:6] * angle))
+
+
+def _modelled(
+    system: NormalEquations, inner: NDArray[np.float64], of_gains: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """What the other unknowns ``(n_inner,)`` and slope gains change of the matrix."""
+    k, n_trends = system.n_common, system.trends.shape[1]
+    n_kinds, _, n_act = system.actuator_derivatives.shape
+    common, by_line, by_trend, by_actuator = np.split(
+        inner, np.cumsum([k, len(inner) - k - n_trends - n_kinds * n_act, n_trends])
+    )
+    gains = (of_gains - system.coupling @ inner) / system.diagonal + system.trends @ by_trend
+    acting = (system.actuator_derivatives * by_actuator.reshape(n_kinds, 1, n_act)).sum(axis=0)
+    changed = np.tensordot(common, system.common, axes=1) + acting @ system.modes
+    return np.asarray(
+        changed + gains[:, None] * system.model + by_line[system.lines, None] * system.sampling_derivative
+    )

@@ -1,0 +1,82 @@
+"""What a converged fit says where the description of the system is wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from small_matrices import CONFIG, GRID, MODEL, NOISE, TRUTH, measured
+from small_system import SMALL
+
+from escape_hw.calibration.sprint.fit import sprint
+from escape_hw.config.loader import load_system
+from escape_sim.models.factory import make_fast_model
+
+Change = Callable[[NDArray[np.float32]], NDArray[np.float64]]
+
+
+def stretched(data: NDArray[np.float32]) -> NDArray[np.float64]:
+    """The x slopes of a camera with narrow pixels."""
+    x, y = np.split(data.astype(float), 2)
+    return np.concatenate([1.05 * x, y])
+
+
+def clocked(data: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Slopes of a camera that is turned by one degree against its lenslets."""
+    x, y = np.split(data.astype(float), 2)
+    turn = np.deg2rad(1.0)
+    return np.concatenate([np.cos(turn) * x - np.sin(turn) * y, np.sin(turn) * x + np.cos(turn) * y])
+
+
+def without_actuators(data: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Two actuators do not move."""
+    data = data.astype(float)
+    data[:, [5, 30]] = NOISE * np.random.default_rng(0).normal(size=(len(data), 2))
+    return data
+
+
+def with_a_dark_corner(data: NDArray[np.float32]) -> NDArray[np.float64]:
+    """The first four sub-apertures have no light."""
+    data, n = data.astype(float), len(data) // 2
+    dark = np.r_[0:4, n : n + 4]
+    data[dark] = NOISE * np.random.default_rng(0).normal(size=(8, data.shape[1]))
+    return data
+
+
+@pytest.mark.parametrize(
+    ("change", "remark"),
+    [
+        (stretched, "the x slopes are"),
+        (clocked, "the slopes are turned by"),
+        (without_actuators, "actuators that hardly respond: 5, 30;"),
+        (with_a_dark_corner, "4 of 112 sub-apertures hardly respond, (row, column) (0, 4)"),
+    ],
+)
+def test_it_is_named(change: Change, remark: str) -> None:
+    matrix = measured(0)
+    estimate = sprint(replace(matrix, data=change(matrix.data).astype(np.float32)), MODEL)
+    assert any(remark in note for note in (*estimate.notes, *estimate.warnings)), estimate.notes
+    # The error of the rotation includes what clocking does to it.
+    assert abs(estimate.registration.rotation - TRUTH.rotation) < 3 * estimate.sigma[2]
+
+
+def test_a_correct_description_has_no_remark() -> None:
+    assert not sprint(measured(0), MODEL).notes
+
+
+def test_a_wrong_pitch_is_named() -> None:
+    across = 1.05 * CONFIG.devices.dm.pitches_across_pupil
+    wrong = load_system("razor-shwfs", overrides=(*SMALL, f"devices.dm.pitches_across_pupil={across}"))
+    estimate = sprint(measured(0), make_fast_model(wrong, GRID))
+    assert any("larger on the sensor than described" in note for note in estimate.notes), estimate.notes
+
+
+def test_noise_alone_is_no_wrong_layout() -> None:
+    matrix = measured(0)
+    noise = 1.2 * NOISE * np.random.default_rng(0).normal(size=matrix.data.shape)
+    estimate = sprint(replace(matrix, data=noise.astype(np.float32)), MODEL)
+    assert not estimate.converged
+    assert "does the mirror move" in estimate.warnings[0]
