@@ -34,7 +34,7 @@ def bench(monkeypatch, tmp_path):
 
 @pytest.fixture
 def undrawn(monkeypatch):
-    """Reports whose figures are made and not drawn, which takes most of their time; test_report draws them."""
+    """Reports whose figures are made and not drawn, which takes most of the time; test_report draws them."""
     monkeypatch.setattr(style, "svg", lambda figure, key: "<svg></svg>")
 
 
