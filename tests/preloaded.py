@@ -8,6 +8,7 @@ empty (other tests draw them). Tests of the start of Python itself use :data:`ru
 from __future__ import annotations
 
 import atexit
+import contextlib
 import gc
 import importlib
 import json
@@ -161,12 +162,15 @@ def serve(descriptor: str) -> Callable[[], None]:
         return _become(json.loads(order), streams)
     for file in streams:
         os.close(file)
-    os.write(reply, f"{pid}\n".encode())
-    os.waitid(os.P_PID, pid, os.WEXITED | os.WNOWAIT)
-    os.write(reply, b"ended\n")
-    os.read(reply, 3)
+    # Who asked may have ended.
+    with contextlib.suppress(OSError):
+        os.write(reply, f"{pid}\n".encode())
+        os.waitid(os.P_PID, pid, os.WEXITED | os.WNOWAIT)
+        os.write(reply, b"ended\n")
+        os.read(reply, 3)
     _, status, usage = os.wait4(pid, 0)
-    os.write(reply, f"{os.waitstatus_to_exitcode(status)} {usage.ru_utime + usage.ru_stime}\n".encode())
+    with contextlib.suppress(OSError):
+        os.write(reply, f"{os.waitstatus_to_exitcode(status)} {usage.ru_utime + usage.ru_stime}\n".encode())
     os._exit(0)
 
 
