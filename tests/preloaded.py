@@ -96,7 +96,7 @@ def run(
     words: Sequence[str],
     environment: Mapping[str, str] | None = None,
     folder: Path | None = None,
-    timeout_s: float = 120.0,
+    timeout_s: float = 240.0,
 ) -> subprocess.CompletedProcess[str]:
     """Run a process to its end."""
     with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err, open(os.devnull) as none:

@@ -29,7 +29,7 @@ def bare(request, tmp_path_factory) -> dict[str, str]:
 def ended(words, environment, **streams) -> subprocess.CompletedProcess[str]:
     """Run a command to its end."""
     return subprocess.run(
-        [*ESCAPE, *map(str, words)], text=True, check=False, env=environment, timeout=60, **streams
+        [*ESCAPE, *map(str, words)], text=True, check=False, env=environment, timeout=240, **streams
     )
 
 
