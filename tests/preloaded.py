@@ -82,9 +82,13 @@ class Preloaded:
             self._reply.send(b"end")
             code, cpu_s = self._lines.readline().split()
             self._end = End(int(code), float(cpu_s))
-            self._lines.close()
-            self._reply.close()
+            self.close()
         return self._end
+
+    def close(self) -> None:
+        """Hear no more of it."""
+        self._lines.close()
+        self._reply.close()
 
     def send_signal(self, number: int) -> None:
         """Send it a signal, unless its end is known."""
@@ -105,6 +109,7 @@ def run(
             ended = started.wait(timeout_s)
         except TimeoutError:
             started.send_signal(signal.SIGKILL)
+            started.close()
             raise
         texts = []
         for file in (out, err):
@@ -127,6 +132,8 @@ def _parent() -> socket.socket:
                 pass_fds=[theirs.fileno()],
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
+                # A process with threads must not be forked.
+                env={**os.environ, **{f"{name}_NUM_THREADS": "1" for name in ("OPENBLAS", "OMP", "NUMBA")}},
             )
         _parents[os.getpid()] = ours
         atexit.register(process.wait, 30)
