@@ -16,6 +16,9 @@ FLOOR_PYTHON ?= python3.11
 # One thread per process: two test processes whose linear algebra also starts threads slow each other down.
 ONE_THREAD := OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 NUMBA_NUM_THREADS=1 MPLBACKEND=Agg
 
+# A file of tests stays in one process, which makes what its tests share; the folders with long files come first.
+WORKERS := -n 2 --dist loadfile --no-loadscope-reorder
+
 .PHONY: help run test test-all floor check docs perf clean
 
 help: ## List the targets
@@ -25,18 +28,18 @@ run: $(VENV)/run.stamp ## Calibrate the simulated RAZOR bench, close the loop, w
 	$(BIN)/escape reproduce shwfs $(ARGS)
 
 test: $(VENV)/test.stamp ## Run the tests
-	$(ONE_THREAD) $(BIN)/python -m pytest -n 2 --dist loadgroup $(ARGS)
+	$(ONE_THREAD) $(BIN)/python -m pytest $(WORKERS) $(ARGS)
 
 test-all: $(VENV)/all.stamp ## Run every test, also the slow ones, with all optional packages
 	$(BIN)/python tests/system_packages.py --install
-	$(ONE_THREAD) $(BIN)/python -m pytest -n 2 --dist loadgroup -m "not hardware and not screenshots" $(ARGS)
+	$(ONE_THREAD) $(BIN)/python -m pytest $(WORKERS) -m "not hardware and not screenshots" $(ARGS)
 
 floor: ## Run the tests with the oldest versions that pyproject.toml allows
 	$(FLOOR_PYTHON) -m venv $(FLOOR)
 	$(FLOOR)/bin/python .ci/floor.py > $(FLOOR)/constraints.txt
 	$(FLOOR)/bin/python -m pip --disable-pip-version-check install --quiet \
 		--constraint $(FLOOR)/constraints.txt --editable '.[test]'
-	$(ONE_THREAD) $(FLOOR)/bin/python -m pytest -n 2 --dist loadgroup -W default::DeprecationWarning $(ARGS)
+	$(ONE_THREAD) $(FLOOR)/bin/python -m pytest $(WORKERS) -W default::DeprecationWarning $(ARGS)
 
 check: $(VENV)/dev.stamp ## Check style, types and layers
 	$(BIN)/ruff check .

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import preloaded
 import pytest
 from running import ESCAPE, Running
 from small_system import configuration
@@ -35,8 +36,11 @@ def escape(environment: dict[str, str]) -> Callable[..., subprocess.CompletedPro
     """Run a command to its end."""
 
     def call(*words: object, **options: Any) -> subprocess.CompletedProcess[str]:
+        told = [str(word) for word in words]
+        if not options:
+            return preloaded.run(told, environment)
         return subprocess.run(
-            [*ESCAPE, *map(str, words)],
+            [*ESCAPE, *told],
             capture_output=True,
             text=True,
             check=False,

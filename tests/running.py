@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import subprocess
 import sys
 import threading
@@ -12,6 +13,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+from preloaded import End, Preloaded
 
 ESCAPE = (sys.executable, "-c", "from escape_hw.cli import main; main()")
 
@@ -28,16 +31,23 @@ class Ended:
 
 
 class Running:
-    """A command under way, read line by line."""
+    """A command under way, read line by line; ``fresh`` starts a Python for it."""
 
-    def __init__(self, words: Sequence[object], environment: dict[str, str]) -> None:
-        self._process = subprocess.Popen(
-            [*ESCAPE, *map(str, words)],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            env=environment,
-        )
+    def __init__(self, words: Sequence[object], environment: dict[str, str], *, fresh: bool = False) -> None:
+        told = [str(word) for word in words]
+        (out, out_end), (err, err_end) = os.pipe(), os.pipe()
+        self._process: Preloaded | subprocess.Popen[bytes]
+        if fresh:
+            self._process = subprocess.Popen(
+                [*ESCAPE, *told], stdout=out_end, stderr=err_end, env=environment
+            )
+        else:
+            with open(os.devnull) as none:
+                self._process = Preloaded(told, (none.fileno(), out_end, err_end), environment)
+        os.close(out_end)
+        os.close(err_end)
+        self._stdout, self._stderr = os.fdopen(out, encoding="utf-8"), os.fdopen(err, encoding="utf-8")
+        self._end: End | None = None
         self.lines: list[str] = []
         self._arrived = threading.Condition()
         self._ended = False
@@ -45,8 +55,7 @@ class Running:
         self._reader.start()
 
     def _read(self) -> None:
-        assert self._process.stderr is not None
-        for line in self._process.stderr:
+        for line in self._stderr:
             with self._arrived:
                 self.lines.append(line.rstrip())
                 self._arrived.notify_all()
@@ -77,28 +86,30 @@ class Running:
                 time.sleep(pause_s)
             # Not reaped before the end, so the number is still ours.
             os.kill(self._process.pid, which)
-        assert self._process.stdout is not None
-        out = self._process.stdout.read()
-        self._process.stdout.close()
-        _, status, usage = os.wait4(self._process.pid, 0)
+        out = self._stdout.read()
+        end = self._wait()
         wall = time.monotonic() - began
-        self._process.returncode = os.waitstatus_to_exitcode(status)
-        self._reader.join(5)
-        assert self._process.stderr is not None
-        self._process.stderr.close()
-        return Ended(
-            self._process.returncode,
-            wall,
-            usage.ru_utime + usage.ru_stime - before,
-            json.loads(out) if out.strip() else {},
-            self.lines,
-        )
+        document = json.loads(out) if out.strip() else {}
+        return Ended(end.code, wall, end.cpu_s - before, document, self.lines)
 
     def kill(self) -> None:
         """End it, if it has not ended."""
-        if self._process.returncode is None:
-            self._process.kill()
-            self._process.communicate()
+        if self._end is None:
+            self._process.send_signal(signal.SIGKILL)
+            self._wait()
+
+    def _wait(self) -> End:
+        """Wait for the end."""
+        if isinstance(self._process, Preloaded):
+            self._end = self._process.wait()
+        else:
+            _, status, usage = os.wait4(self._process.pid, 0)
+            self._process.returncode = os.waitstatus_to_exitcode(status)
+            self._end = End(self._process.returncode, usage.ru_utime + usage.ru_stime)
+        self._reader.join(5)
+        self._stdout.close()
+        self._stderr.close()
+        return self._end
 
     def _cpu_s(self) -> float:
         """Processor time that the process has used so far."""

@@ -30,7 +30,7 @@ def _load_atomic(typing_context: Any, address: Any) -> Any:
     return types.uint64(types.uint64), code
 
 
-@njit("b1(u8, u8, u8)", nogil=True)
+@njit("b1(u8, u8, u8)", cache=True, nogil=True)
 def wait_for_change(address, value, n_polls):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Poll a word up to ``n_polls`` times; whether it differs from ``value``."""
     for _ in range(n_polls):

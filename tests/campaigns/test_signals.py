@@ -65,6 +65,7 @@ def test_a_signal_to_a_calibration(
         running = Running(
             [*words, "--frames", 10_000_000, "--out", out, "--json"],
             {**environment, **server.environment, "XDG_RUNTIME_DIR": str(runtime)},
+            fresh=True,
         )
         try:
             if measuring:

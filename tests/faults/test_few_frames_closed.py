@@ -11,7 +11,7 @@ from small_bench import INJECTED, assert_flat, small
 from escape_hw.calibration.escape.method import escape
 from escape_hw.errors import Aborted, CalibrationError, TooFewFrames
 
-SEEDS = [range(2), pytest.param(range(4), marks=pytest.mark.slow)]
+SEEDS = [range(1), pytest.param(range(4), marks=pytest.mark.slow)]
 #: Fewer than a matrix of 30 modes takes (82).
 FRAMES = 50
 
@@ -34,7 +34,7 @@ def pull(found) -> np.ndarray:
     return (found.registration.registration.to_array() - INJECTED) / found.registration.sigma
 
 
-@pytest.mark.parametrize("seeds", SEEDS, ids=["two", "four"])
+@pytest.mark.parametrize("seeds", SEEDS, ids=["one", "four"])
 @pytest.mark.parametrize(
     "name", ["as it is", "lost frames", "vibration", "a matrix half as large", "commands cut by the limits"]
 )

@@ -19,9 +19,9 @@ from escape_hw.runtime.procedures.calibration import calibrate_with_method
 OFTEN = ("twin.loss_probability=0.002", "calibration.checkpoint_s=0.2")
 #: Method, options, and the stage and the share of it after which the run is interrupted.
 CASES = {
-    "docrime": ("docrime", {"frames": 3000}, "DO-CRIME", 0.6),
+    "docrime": ("docrime", {"frames": 1500}, "DO-CRIME", 0.6),
     "docrime, first frames": ("docrime", {"frames": 1500}, "DO-CRIME", 0.3),
-    "docrime, closed loop": ("docrime", {"frames": 3000, "poke": 0.01}, "DO-CRIME in closed loop", 0.6),
+    "docrime, closed loop": ("docrime", {"frames": 1500, "poke": 0.01}, "DO-CRIME in closed loop", 0.6),
     "push-pull-fast": ("push-pull-fast", {"frames": 3000}, "fast push-pull", 0.5),
     "modulated": ("modulated", {"frames": 200}, "modulation", 0.6),
     "push-pull": ("push-pull", {"frames": 10}, "push-pull", 0.5),

@@ -17,6 +17,7 @@ from escape_hw.calibration.sprint.telemetry_fit import decorrelate_columns
 FRAMES, RUNS = 90, 6
 
 
+@pytest.mark.slow
 def test_the_frames_err_less_than_the_sums_of_a_matrix():
     by_frames, by_sums = np.empty((2, RUNS, 5))
     with small() as bench:

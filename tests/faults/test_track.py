@@ -179,14 +179,14 @@ def test_a_failed_actuator_raises_an_alarm_that_no_registration_explains(start):
         "twin.loss_probability=0.05",
         "twin.vibration.amplitude_rad=[4e-6,2e-6]",
         "devices.dm.limits.max_stroke=0.12",
-        "devices.dm.limits.max_slew=0.03",
+        pytest.param("devices.dm.limits.max_slew=0.03", marks=pytest.mark.slow),
     ],
     ids=["lost frames", "vibration", "clipped by the stroke", "clipped by the slew"],
 )
 def test_faults_that_bias_nothing(start, more):
     with small(QUIET, more) as bench:
         truth = bench.dm.twin.flexure.at(0.0).to_array()
-        found = followed(bench, start, 5)
+        found = followed(bench, start, 3)
     assert found.stable
     last = np.array([found.rows[name][-1] for name in PARAMETERS])
     sigma = np.array([found.rows[f"{name}_sigma"][-1] for name in PARAMETERS])

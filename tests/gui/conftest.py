@@ -32,7 +32,11 @@ from escape_gui.settings import Settings
 @pytest.fixture(scope="session")
 def qapp() -> QApplication:
     """The application, configured as by the command."""
-    return qt_application()
+    application = qt_application()
+    # Every test collects garbage and looks through all objects: those that are there for good are left out.
+    gc.collect()
+    gc.freeze()
+    return application
 
 
 def segments() -> set[str]:

@@ -66,15 +66,7 @@ def realisation(number):
     return open_system(SYSTEM, set=registration_overrides(random_registration(number)), seed=number + 1)
 
 
-def test_a_thousand_frames_in_closed_loop_at_small_pokes():
-    """1 % of a sub-aperture, 0.02 degrees, 0.1 %: pokes of 0.2 % of the stroke."""
-    with realisation(0) as bench:
-        errors, pulls = errors_and_pulls(looked(bench, 2, 500)[0], random_registration(0))
-    assert (np.abs(errors) <= 2 * GOAL).all(), errors
-    assert np.abs(pulls).max() < 4
-
-
-@pytest.mark.parametrize("number", [1, 2])
+@pytest.mark.parametrize("number", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_any_controller_gives_the_same(number):
     truth, start = random_registration(number), None
     with System.from_config(configuration(*registration_overrides(truth), seed=number)) as bench:
@@ -135,6 +127,7 @@ def test_a_sheared_mirror_is_found_beside_the_registration(number):
     assert found.misfit < plain.misfit
 
 
+@pytest.mark.slow
 def test_the_pyramid_keeps_shear_and_shifted_images_beside_its_curve():
     with small_pyramid(
         "twin.loss_probability=0", 'calibration.extra_parameters=["anamorphosis","pupil_shift"]'
@@ -152,6 +145,7 @@ def test_the_pyramid_keeps_shear_and_shifted_images_beside_its_curve():
 
 @pytest.mark.slow
 def test_twelve_realisations():
+    """A thousand frames at pokes of 0.2 % of the stroke: 1 % of a sub-aperture, 0.02 degrees, 0.1 %."""
     errors, pulls = [], []
     for number in range(12):
         with realisation(number) as bench:

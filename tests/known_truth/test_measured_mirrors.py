@@ -25,13 +25,9 @@ DATES = ("20230901151403", "20231214151118", "20231219151519")
 #: Room for pupil images of 36 pixels.
 _PUPILS = "sensor.pupils_px=[[69.0,35.0],[111.0,35.0],[69.0,78.0],[109.0,77.0]]"
 
-pytestmark = [
-    # Several tests read the same fits.
-    pytest.mark.xdist_group("dm97"),
-    pytest.mark.skipif(
-        not (FOLDER / "dm97.json").is_file(), reason=f"no measured matrices in {FOLDER} (ESCAPE_SHARED_DATA)"
-    ),
-]
+pytestmark = pytest.mark.skipif(
+    not (FOLDER / "dm97.json").is_file(), reason=f"no measured matrices in {FOLDER} (ESCAPE_SHARED_DATA)"
+)
 
 
 @cache
@@ -41,7 +37,9 @@ def fitted(date: str) -> tuple[InteractionMatrix, SprintFit]:
     return matrix, fit_matrix(matrix)
 
 
-@pytest.mark.parametrize("date", DATES)
+@pytest.mark.parametrize(
+    "date", [DATES[0], *(pytest.param(date, marks=pytest.mark.slow) for date in DATES[1:])]
+)
 def test_the_fit_of_a_measured_mirror_converges(date: str) -> None:
     matrix, fit = fitted(date)
     assert fit.estimate.converged, fit.estimate.warnings
@@ -73,6 +71,7 @@ def test_broken_lenslets_are_named() -> None:
     assert "sub-apertures" in estimate.warnings[0]
 
 
+@pytest.mark.slow
 def test_a_mirror_that_did_not_move_is_refused() -> None:
     estimate = fitted("20231214125445")[1].estimate
     assert not estimate.converged, estimate

@@ -50,3 +50,14 @@ def test_no_model_reads_the_twin(sensor, model):
     for mine, its in zip(one.variants(), other.variants(), strict=True):
         np.testing.assert_array_equal(mine.zonal_matrix(SOMEWHERE), its.zonal_matrix(SOMEWHERE))
     np.testing.assert_array_equal(one.influence_functions()[0], other.influence_functions()[0])
+
+
+def test_a_model_made_for_the_basis_computes_no_slopes(monkeypatch):
+    def computed(*_):
+        raise AssertionError("slopes were computed")
+
+    monkeypatch.setattr("escape_sim.models.shack_hartmann.slope_weights", computed)
+    model = model_factory("fast")(load_system("razor-shwfs", overrides=LENSLETS), None)
+    assert len(model.influence_functions()[0]) == 37
+    with pytest.raises(AssertionError, match="were computed"):
+        model.zonal_matrix(SOMEWHERE)

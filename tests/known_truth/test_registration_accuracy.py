@@ -30,8 +30,8 @@ def _meets_goal(curves: dict[str, Any], estimator: str, frames: int) -> bool:
 
 @pytest.fixture(scope="module")
 def few() -> list[RealisationErrors]:
-    """Three registrations, all imperfections on, 0.6 seconds of frames each."""
-    return [run_realisation(SYSTEM, number, (300,)) for number in (0, 1, 2)]
+    """A registration, all imperfections on, 0.6 seconds of frames; thirty in the slow tests."""
+    return [run_realisation(SYSTEM, 0, (300,))]
 
 
 def test_registrations_fill_their_ranges_and_differ() -> None:
@@ -40,7 +40,7 @@ def test_registrations_fill_their_ranges_and_differ() -> None:
     assert (drawn.std(axis=0) > 0.5 * HALF_RANGES).all()
 
 
-def test_three_hundred_frames_meet_the_goal_on_every_registration(few: Sequence[RealisationErrors]) -> None:
+def test_three_hundred_frames_meet_the_goal(few: Sequence[RealisationErrors]) -> None:
     curves = summary(few, (300,))
     assert _meets_goal(curves, "whitened", 300)
     assert curves["fewest_frames"]["whitened"] == 300

@@ -44,7 +44,7 @@ def test_the_delay_of_each_controller_is_found(frames):
 
 def test_the_loop_closes_on_the_star(system, found):
     model = system.take_model_psf()
-    run = system.close_loop(found, frames=600, model_psf=model, gain=0.4)
-    still = system.close_loop(found, frames=600, model_psf=model, gain=1e-4)
+    run = system.close_loop(found, frames=300, model_psf=model, gain=0.4)
+    still = system.close_loop(found, frames=300, model_psf=model, gain=1e-4)
     assert run.stable
     assert run.strehl.peak.value > 1.5 * still.strehl.peak.value

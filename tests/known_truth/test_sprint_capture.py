@@ -66,12 +66,11 @@ def test_converges_from_large_misregistrations(model, matrix_at, injected):
 
 def test_a_shift_by_more_than_a_pitch_is_not_reported_as_converged(model, matrix_at):
     injected = Registration(shift_x=400.0)
-    estimate = sprint(matrix_at(injected), model, max_iterations=10, coarse_search=False)
+    few = {"modes": 20, "coarse_search": False}
+    estimate = sprint(matrix_at(injected), model, max_iterations=10, **few)
     assert not estimate.converged
     assert any("explains" in warning for warning in estimate.warnings)
-    assert sprint(
-        matrix_at(injected), model, start=Registration(shift_x=300.0), coarse_search=False
-    ).converged
+    assert sprint(matrix_at(injected), model, start=Registration(shift_x=300.0), **few).converged
 
 
 def random_far(number):
@@ -93,7 +92,7 @@ def test_two_pitches_away_turned_and_scaled(model, matrix_at, solver):
         assert (np.abs(error) < 5 * estimate.sigma).all(), injected
 
 
-@pytest.mark.parametrize("n_modes", [5, 40])
+@pytest.mark.parametrize("n_modes", [5, pytest.param(40, marks=pytest.mark.slow)])
 def test_random_registrations_are_recovered_or_refused(model, matrix_at, n_modes):
     """Anywhere within three pitches and far beyond: what is called converged is right."""
     found = 0

@@ -14,8 +14,6 @@ import escape_hw
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = {"escape_hw", "escape_gui", "escape_drivers", "escape_sim", "escape_benchmarks"}
 
-pytestmark = pytest.mark.xdist_group("wheel")
-
 
 def run(*command: str, cwd: Path, **environment: str) -> str:
     inherited = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "PYTHONHOME")}

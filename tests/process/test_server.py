@@ -323,7 +323,7 @@ def test_a_run_whose_holder_vanished_goes_on_and_control_is_free(system: Path, t
     ):
         holder = served.connect(control=True)
         until_idle(watcher)
-        run = holder.start("docrime", frames=20_000)
+        run = holder.start("docrime", frames=5000)
         wait_for(lambda: watcher.state.mirror.peak > 0, "pokes")
         holder._link.close()  # as after the kill of a window
         wait_for(lambda: watcher.state.lease is None, "control is free")

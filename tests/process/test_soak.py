@@ -110,7 +110,7 @@ def soak(system: Path, folder: Path, warm_up_s: float, seconds: float, limit_byt
 
 
 def test_nothing_grows_within_seconds(system: Path, tmp_path: Path) -> None:
-    soak(system, tmp_path, warm_up_s=6, seconds=12, limit_bytes_per_s=500e3)
+    soak(system, tmp_path, warm_up_s=6, seconds=6, limit_bytes_per_s=500e3)
 
 
 @pytest.mark.slow

@@ -29,7 +29,7 @@ def bare(request, tmp_path_factory) -> dict[str, str]:
 def ended(words, environment, **streams) -> subprocess.CompletedProcess[str]:
     """Run a command to its end."""
     return subprocess.run(
-        [*ESCAPE, *map(str, words)], text=True, check=False, env=environment, timeout=60, **streams
+        [*ESCAPE, *map(str, words)], text=True, check=False, env=environment, timeout=240, **streams
     )
 
 
@@ -83,19 +83,25 @@ def test_a_command_without_standard_output(bare, words):
     assert done.stderr == "error: standard output cannot be written (Bad file descriptor)\n"
 
 
-@pytest.mark.parametrize("words", COMMANDS[1:], ids=" ".join)
+@pytest.fixture(scope="module", params=COMMANDS[1:], ids=" ".join)
+def whole(bare, request) -> tuple[tuple[str, ...], str]:
+    """A command, and its output where nothing is in the way."""
+    done = ended(request.param, bare, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout
+    return request.param, done.stdout
+
+
 @pytest.mark.parametrize("end", ["full", "pipe", "none"])
-def test_standard_error_changes_no_result(bare, words, end):
-    whole = ended(words, bare, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
-    assert (whole.returncode, whole.stderr) == (0, "")
-    assert whole.stdout
+def test_standard_error_changes_no_result(bare, whole, end):
+    words, output = whole
     told = {"full": lambda: os.open("/dev/full", os.O_WRONLY), "pipe": without_reader}.get(end)
     nobody = subprocess.DEVNULL if told is None else told()
     streams = {"stdout": subprocess.PIPE, "stderr": nobody}
     done = ended(words, bare, **streams, **({"preexec_fn": closing(2)} if told is None else {}))
     if told is not None:
         os.close(nobody)
-    assert (done.returncode, done.stdout) == (0, whole.stdout)
+    assert (done.returncode, done.stdout) == (0, output)
 
 
 @pytest.mark.parametrize("words", [("systms",), ("systems", "--jsn")], ids=" ".join)

@@ -20,7 +20,6 @@ def loops(run: Path) -> list[dict[str, str]]:
 
 
 @pytest.mark.slow
-@pytest.mark.xdist_group("sweep")
 def test_killed_workers_and_a_killed_sweep_lose_nothing(arguments, tmp_path):
     run, again = tmp_path / "run", tmp_path / "again"
     database = run / "study.db"

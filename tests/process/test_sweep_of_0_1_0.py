@@ -61,7 +61,6 @@ def test_a_finished_sweep_is_analysed_again(runs):
 
 
 @pytest.mark.slow
-@pytest.mark.xdist_group("sweep")
 def test_an_unfinished_sweep_is_resumed(runs):
     database = runs / "sweep-unfinished" / "study.db"
     before = finished(database)

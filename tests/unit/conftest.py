@@ -11,7 +11,7 @@ from escape_hw.io.fits.matrix import save_matrix
 from escape_hw.report.figures import style
 from escape_hw.report.run_report import REPORT, write_report
 
-__all__ = ["bench", "document", "empty_reports", "escape", "im", "pictures", "reports"]
+__all__ = ["bench", "document", "empty_reports", "escape", "im", "pictures", "reports", "undrawn"]
 
 PNG = style.png
 
@@ -33,8 +33,14 @@ def bench(monkeypatch, tmp_path):
 
 
 @pytest.fixture
-def reports(bench, monkeypatch):
-    """The real report after all."""
+def undrawn(monkeypatch):
+    """Reports whose figures are made and not drawn, which takes most of the time; test_report draws them."""
+    monkeypatch.setattr(style, "svg", lambda figure, key: "<svg></svg>")
+
+
+@pytest.fixture
+def reports(bench, undrawn, monkeypatch):
+    """The real report after all, without drawings."""
     monkeypatch.setattr("escape_hw.runtime.procedures.products.write_report", write_report)
 
 

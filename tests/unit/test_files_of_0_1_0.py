@@ -70,6 +70,7 @@ def test_recorded_frames_are_read():
     assert recording.data.shape[1:] == (128, 128)
 
 
+@pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize("run", RUNS)
 def test_a_run_is_shown_and_its_report_built_again(run, escape, document, tmp_path):
     folder = tmp_path / run

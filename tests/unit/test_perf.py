@@ -7,7 +7,6 @@ import json
 import math
 import subprocess
 import sys
-import time
 from importlib.metadata import EntryPoint
 from types import SimpleNamespace
 
@@ -59,17 +58,18 @@ def test_the_ratio_states_how_many_times_better():
     }
 
 
-def test_two_functions_are_timed_in_turn():
-    calls = []
+def test_two_functions_are_timed_in_turn(monkeypatch):
+    calls, clock = [], [0.0]
+    monkeypatch.setattr("escape_hw.api.benchmark.time.perf_counter", lambda: clock[0])
 
     def call(name, seconds):
         calls.append(name)
-        time.sleep(seconds)
+        clock[0] += seconds
 
     ours, theirs = time_alternately(
         lambda: call("a", 0.004), lambda: call("b", 0.012), seconds=0.05, rounds=3
     )
-    assert 0.004 <= ours < 0.012 <= theirs
+    assert (ours, theirs) == pytest.approx((0.004, 0.012))
     turns = [c for k, c in enumerate(calls) if k == 0 or calls[k - 1] != c]
     assert "".join(turns).endswith("ababab")
     assert time_alternately(lambda: call("a", 0.001), None, seconds=0.01)[1] is None

@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import signal
 
 from escape_hw.api.concurrency import limit_to_one_thread
 from escape_hw.api.pyramid import IMAGES, PyramidPupils, pupil_boxes, remove_low_orders
@@ -211,6 +210,9 @@ def _find_rough_centres(
     image: NDArray[np.float64], n_sub: int, nominal_px: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Rough centres ``(4, 2)`` of bright disks with dark rings around them."""
+    # Half a second, which a Shack-Hartmann sensor need not wait for.
+    from scipy.signal import fftconvolve
+
     pad = n_sub
     radius, half = n_sub / 2, n_sub // 2 + 4
     line = np.arange(-half, half + 1)
@@ -219,7 +221,7 @@ def _find_rough_centres(
     kernel = disk / disk.sum() - ring / ring.sum()
     # The square root reduces the contrast within an image.
     light = np.pad(np.sqrt(np.maximum(image, 0.0)), pad, mode="edge")
-    score = signal.fftconvolve(light, kernel, mode="same")
+    score = fftconvolve(light, kernel, mode="same")
     centres, contrast = [], []
     reach = max(2, round(_REACH * n_sub))
     for x, y in nominal_px:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -390,8 +391,12 @@ class ShackHartmannModel(DesignModel):
         self._opd_per_command_m = 2 * config.devices.dm.stroke_m
         self._grid = grid
         self._variants: list[ShackHartmannModel] | None = None
-        weights = slope_weights(config, grid, self._pupil)
-        self._slopes = SlopeOperator(weights, grid.valid, self._pupil.sub_aperture_m)
+
+    @cached_property
+    def _slopes(self) -> SlopeOperator:
+        """Slopes of wavefronts; the modal basis, for which models are made too, needs none."""
+        weights = slope_weights(self._config, self._grid, self._pupil)
+        return SlopeOperator(weights, self._grid.valid, self._pupil.sub_aperture_m)
 
     def influence_functions(self) -> tuple[NDArray[np.float64], NDArray[np.bool_], float]:
         """Nominal influence functions for the modal basis, see :class:`SyntheticModel`."""
