@@ -1,13 +1,20 @@
-"""Strehl ratios on equal turbulence of ESCAPE with optical gains, push-pull (the baseline) and DO-CRIME
-alone.
+"""Strehl ratios on equal turbulence of ESCAPE, push-pull (the baseline) and DO-CRIME alone, and
+registrations.
 
     python benchmarks/studies/loop_comparison.py --seeds 1 2 3 4 5 6 7 8 9 10 --out paired
+    python benchmarks/studies/loop_comparison.py --system revolt-shwfs --seeds 1 2 3 4 5 --short 1000 \\
+        --calibration 4000 --set loop.gain=0.4 --out paired --table docs/studies/paired-loops
+    python benchmarks/studies/loop_comparison.py --system maps-nir --no-gains --no-baseline \\
+        --out paired --table docs/studies/paired-loops
 
 Each seed is a twin with a mirror and turbulence of its own. Every matrix is closed at its own best gain,
-found on the first seconds of that turbulence, and evaluated on later ones, the same for all three. Matrices
-and loops are saved in a folder and are not repeated; with ``--minutes 4`` nothing new is started after four
+found on the first seconds of that turbulence, and evaluated on later ones, the same for all. On a pyramid
+ESCAPE is scaled by its optical gains, unless ``--no-gains`` asks for the matrix as calibrated. Matrices and
+loops are saved in a folder and are not repeated; with ``--minutes 4`` nothing new is started after four
 minutes, and the next call continues. Prints the table of the finished seeds, with the differences paired by
-seed. A seed of the pyramid bench takes some six minutes on an idle core.
+seed and their two-sided 95 % intervals (Student's t). ``--table`` is the folder of the raw table
+(``SYSTEM-NAME.jsonl``, a line per seed) and of the page made from it (``SYSTEM-NAME.md``). A seed of the
+pyramid bench takes some six minutes on an idle core.
 """
 
 from __future__ import annotations
@@ -15,7 +22,7 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -23,22 +30,27 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from realisation_tables import append_line, read_lines, study_parser
+from realisation_tables import Line, append_line, each_realisation, read_lines, study_parser
+from scipy import stats
 
+from escape_hw.api.registration import PARAMETERS, UNITS
 from escape_hw.api.results import CalibrationResult
 from escape_hw.calibration.loop.performance import close_loop
 from escape_hw.calibration.optical_gain.bootstrap import bootstrap_gains
 from escape_hw.calibration.sprint.synthetic_matrix import static_light_matrix
+from escape_hw.config.loader import load_system
+from escape_hw.config.sensor import PyramidSection
 from escape_hw.io.fits.matrix import load_matrix, save_matrix
+from escape_hw.io.provenance import get_git_state
 from escape_hw.runtime.session.record import BenchRecord
 from escape_hw.runtime.session.system import System, open_system
 from escape_sim.devices.true_optical_gains import get_simulated_bench
 
-ESCAPE, BASELINE, DOCRIME = "ESCAPE with optical gains", "push-pull", "DO-CRIME alone"
+ESCAPE, BASELINE, DOCRIME = "ESCAPE", "push-pull", "DO-CRIME alone"
 #: Start times of evaluated loops and bootstrap on the twin's clock, each after the previous turbulence.
 EVALUATION_START_S, BOOTSTRAP_START_S = 4.0, 10.0
-#: Gains tried, relative to the usual one in effect; the best at an end is followed one further.
-FACTORS, BELOW, ABOVE = (0.85, 1.0, 1.2), 0.7, 1.4
+#: Gains tried, relative to the usual one in effect; while the best is at an end, further ones by this ratio.
+FACTORS, RATIO, MAX_FURTHER = (0.85, 1.0, 1.2), 1.2, 6
 
 
 class TimeBudgetExceeded(Exception):
@@ -101,15 +113,9 @@ class SeedRun:
         print(f"seed {self.number}: {json.dumps(self._records[what])}", flush=True)
 
 
-def matrices(seed: SeedRun) -> dict[str, CalibrationResult]:
-    """The three matrices of a seed, by name."""
+def scaled_by_optical_gains(seed: SeedRun, escape: CalibrationResult) -> CalibrationResult:
+    """The matrix of ESCAPE, scaled by the optical gains that the bootstrap finds."""
     options = seed.options
-    escape = seed.matrix("escape", lambda bench: bench.calibrate("escape", frames=options.calibration))
-    baseline = seed.matrix(
-        "push-pull", lambda bench: bench.calibrate("push-pull", frames=options.baseline, grid=escape.grid)
-    )
-    if escape.measured is None:
-        raise SystemExit(f"{options.calibration} frames are too few for a DO-CRIME matrix")
 
     def rescaled_matrix(bench: System) -> CalibrationResult:
         get_simulated_bench(bench).advance_to(BOOTSTRAP_START_S)
@@ -132,9 +138,36 @@ def matrices(seed: SeedRun) -> dict[str, CalibrationResult]:
         seed.add_record("bootstrap", found)
         return run.rescaled_calibration
 
-    gains = seed.matrix("gains", rescaled_matrix)
-    docrime = replace(escape, matrix=escape.measured, measured=None)
-    return {ESCAPE: gains, BASELINE: baseline, DOCRIME: docrime}
+    return seed.matrix("gains", rescaled_matrix)
+
+
+def matrices(seed: SeedRun) -> dict[str, CalibrationResult]:
+    """The matrices of a seed, by name."""
+    options = seed.options
+    escape = seed.matrix("escape", lambda bench: bench.calibrate("escape", frames=options.calibration))
+    if escape.measured is None:
+        raise SystemExit(f"{options.calibration} frames are too few for a DO-CRIME matrix")
+    found = {ESCAPE: scaled_by_optical_gains(seed, escape) if options.gains else escape}
+    if options.baseline:
+        found[BASELINE] = seed.matrix(
+            "push-pull", lambda bench: bench.calibrate("push-pull", frames=options.baseline, grid=escape.grid)
+        )
+    found[DOCRIME] = replace(escape, matrix=escape.measured, measured=None)
+    return found
+
+
+def registration_line(seed: SeedRun, name: str, frames: int) -> Line:
+    """Error and standard error of the registration from a number of frames."""
+    estimate = seed.matrix(name, lambda bench: bench.calibrate("escape", frames=frames)).registration
+    if estimate is None:
+        raise SystemExit(f"{frames} frames gave no registration")
+    config = load_system(seed.options.system, overrides=seed.options.set)
+    injected = config.twin.registration.to_registration()
+    return {
+        "frames": frames, "converged": estimate.converged, "warnings": list(estimate.warnings),
+        "error": (estimate.registration.to_array() - injected.to_array()).tolist(),
+        "sigma": estimate.sigma.tolist(),
+    }  # fmt: skip
 
 
 def closed_loop_strehl(
@@ -170,27 +203,82 @@ def evaluate_matrices(seed: SeedRun) -> dict[str, tuple[float, float]]:
         share = float(np.median(result.matrix.data.std(0) / each[ESCAPE].matrix.data.std(0)))
         one = partial(closed_loop_strehl, seed, name, result, share)
         scan = {factor: one(factor, options.scan, 0.0) for factor in FACTORS}
-        end = {FACTORS[0]: BELOW, FACTORS[-1]: ABOVE}.get(max(scan, key=scan.__getitem__))
-        if end is not None:
-            scan[end] = one(end, options.scan, 0.0)
+        for _ in range(MAX_FURTHER):
+            best = max(scan, key=scan.__getitem__)
+            if min(scan) < best < max(scan):
+                break
+            further = best * RATIO if best == max(scan) else best / RATIO
+            scan[further] = one(further, options.scan, 0.0)
         best = max(scan, key=scan.__getitem__)
         found[name] = (one(best, options.loop, EVALUATION_START_S), best)
     return found
 
 
-def table(found: dict[int, dict[str, tuple[float, float]]]) -> list[str]:
-    """Lines of the table: each seed, means with the scatter of the seeds, differences paired by seed."""
-    names = (ESCAPE, BASELINE, DOCRIME)
-    lines = ["| seed | " + " | ".join(names) + " |", "|---" * 4 + "|"]
-    for number, one in sorted(found.items()):
-        lines.append(f"| {number} | " + " | ".join(f"{one[name][0]:.2f}" for name in names) + " |")
-    values = {name: np.array([one[name][0] for one in found.values()]) for name in names}
-    lines.append("| mean | " + " | ".join(f"{values[name].mean():.2f}" for name in names) + " |")
-    for one, other in ((ESCAPE, BASELINE), (DOCRIME, BASELINE), (DOCRIME, ESCAPE)):
-        difference = values[one] - values[other]
-        error = difference.std(ddof=1) / np.sqrt(difference.size) if difference.size > 1 else np.nan
-        lines.append(f"{one} minus {other}: {difference.mean():+.2f} +- {error:.2f} % of Strehl ratio")
+def measure_seed(options: argparse.Namespace, number: int, until: float) -> Line:
+    """The line of a seed: registrations, Strehl ratios in %, and best gains relative to the usual one."""
+    seed = SeedRun(options, number, until)
+    loops = evaluate_matrices(seed)
+    registrations = [registration_line(seed, "escape", options.calibration)]
+    if options.short:
+        registrations.insert(0, registration_line(seed, "short", options.short))
+    return {
+        "commit": get_git_state(), "registrations": registrations,
+        "strehl": {name: value for name, (value, _) in loops.items()},
+        "factor": {name: factor for name, (_, factor) in loops.items()},
+    }  # fmt: skip
+
+
+def interval(values: NDArray[np.float64]) -> str:
+    """Mean with its two-sided 95 % interval."""
+    if values.size < 2:
+        return f"{values.mean():+.2f} (one seed, no interval)"
+    half = stats.t.ppf(0.975, values.size - 1) * values.std(ddof=1) / np.sqrt(values.size)
+    return f"{values.mean():+.2f}, 95 % interval {values.mean() - half:+.2f} to {values.mean() + half:+.2f}"
+
+
+def strehl_lines(rows: Sequence[Line]) -> list[str]:
+    """Table of Strehl ratios by seed, and the differences paired by seed."""
+    names = list(rows[0]["strehl"])
+    lines = ["| seed | " + " | ".join(names) + " |", "|---" * (1 + len(names)) + "|"]
+    for row in rows:
+        cells = " | ".join(f"{row['strehl'][name]:.2f}" for name in names)
+        lines.append(f"| {row['realisation']} | {cells} |")
+    values = {name: np.array([row["strehl"][name] for row in rows]) for name in names}
+    lines += ["| mean | " + " | ".join(f"{values[name].mean():.2f}" for name in names) + " |", ""]
+    pairs = [(ESCAPE, BASELINE), (DOCRIME, BASELINE), (ESCAPE, DOCRIME)]
+    return lines + [
+        f"- {one} minus {other}: {interval(values[one] - values[other])} % of Strehl ratio"
+        for one, other in pairs
+        if one in values and other in values
+    ]
+
+
+def registration_lines(rows: Sequence[Line]) -> list[str]:
+    """Table of the registration's rms error and normalised chi-squared, by number of frames."""
+    heading = " | ".join(f"{name.replace('_', ' ')} [{UNITS[name]}]" for name in PARAMETERS)
+    lines = [f"| frames | converged | {heading} |", "|---" * (2 + len(PARAMETERS)) + "|"]
+    for columns in zip(*(row["registrations"] for row in rows), strict=True):
+        errors, sigmas = (np.array([one[key] for one in columns]) for key in ("error", "sigma"))
+        rms, chi2 = np.sqrt(np.mean(errors**2, axis=0)), np.mean(np.square(errors / sigmas), axis=0)
+        cells = " | ".join(f"{a:.3f} ({b:.1f})" for a, b in zip(rms, chi2, strict=True))
+        good = sum(one["converged"] for one in columns)
+        lines.append(f"| {columns[0]['frames']} | {good} of {len(columns)} | {cells} |")
     return lines
+
+
+def page(rows: Sequence[Line], title: str, raw: str) -> list[str]:
+    """The page of a raw table."""
+    asked = rows[0]["asked"]
+    commits = ", ".join(sorted({row["commit"] for row in rows}))
+    return [
+        f"# {title}", "",
+        f"{len(rows)} seeds, commit {commits}. Raw table: [`{raw}`]({raw}). Made by "
+        "`benchmarks/studies/loop_comparison.py` with", "",
+        *(f"- {key}: {value}" for key, value in asked.items()), "",
+        "## Strehl ratio in %, each matrix at its own best gain, on equal turbulence", "",
+        *strehl_lines(rows), "", "## Registration: rms error (normalised chi-squared)", "",
+        *registration_lines(rows),
+    ]  # fmt: skip
 
 
 def main() -> None:
@@ -201,20 +289,32 @@ def main() -> None:
     parser.set_defaults(out=Path("paired"))
     parser.add_argument("--minutes", type=float, default=np.inf, help="start nothing new after this time")
     parser.add_argument("--calibration", type=int, default=1500, help="frames of ESCAPE")
+    parser.add_argument("--short", type=int, default=0, help="frames of a second, shorter ESCAPE; 0: none")
     parser.add_argument("--baseline", type=int, default=20, help="push-pull: frames per push and per pull")
+    parser.add_argument("--no-baseline", dest="baseline", action="store_const", const=0)
+    parser.add_argument("--no-gains", dest="gains", action="store_false", help="no optical gains")
     parser.add_argument("--frames", type=int, default=1200, help="frames per round of the bootstrap, at most")
     parser.add_argument("--accuracy", type=float, default=0.06, help="of the gains")
     parser.add_argument("--scan", type=int, default=400, help="frames of each loop of the gain search")
     parser.add_argument("--loop", type=int, default=1200, help="frames of each evaluated loop")
+    parser.add_argument("--table", type=Path, help="folder of the raw table and its page; default: --out")
+    parser.add_argument("--name", default="paired")
     options = parser.parse_args()
-    until, found = time.monotonic() + 60 * options.minutes, {}
-    for number in options.seeds:
-        try:
-            found[number] = evaluate_matrices(SeedRun(options, number, until))
-        except TimeBudgetExceeded:
-            continue
-    if found:
-        print(*table(found), sep="\n")
+    is_pyramid = isinstance(load_system(options.system, overrides=options.set).sensor, PyramidSection)
+    options.gains = options.gains and is_pyramid
+    keys = ("system", "set", "calibration", "short", "baseline", "gains", "scan", "loop")
+    asked = {key: getattr(options, key) for key in keys}
+    until, stem = time.monotonic() + 60 * options.minutes, f"{options.system}-{options.name}"
+    folder = options.table or options.out
+    target = folder / f"{stem}.jsonl"
+    try:
+        each_realisation(target, asked, options.seeds, lambda number: measure_seed(options, number, until))
+    except TimeBudgetExceeded:
+        print("the time is over; the same command continues")
+    if rows := read_lines(target):
+        lines = page(rows, f"Paired loops: {options.system}", target.name)
+        (folder / f"{stem}.md").write_text("\n".join(lines) + "\n")
+        print(*lines, sep="\n")
 
 
 if __name__ == "__main__":

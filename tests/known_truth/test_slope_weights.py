@@ -233,3 +233,23 @@ def test_a_blurred_spot_follows_a_tilt_as_a_sharp_one_does():
         return total[inner[grid.valid]]
 
     np.testing.assert_allclose(response(blurred), response(still), rtol=0.15)
+
+
+def test_weights_around_given_wavefronts_are_the_mean_of_the_simulated_responses(config):
+    grid = nominal_grid(config)
+    truth, pupil = Truth(config, grid), pupil_geometry(config)
+    at = pupil.coordinates_m / (config.system.pupil_m / 2)
+    # Curved within a lenslet, which no tilt of whole lenslets is.
+    paths = [
+        60e-9 * np.outer(np.sin(50 * at), np.cos(40 * at)) + truth.tilt(0.3, -0.2) * sign for sign in (1, -1)
+    ]
+    surface = surfaces(config, MOVED)[48]
+    exact = np.mean([truth.column(surface, around=path) for path in paths], axis=0)
+
+    def error(model):
+        column = model.zonal_matrix(MOVED)[:, 48]
+        return np.linalg.norm(column - exact) / np.linalg.norm(exact)
+
+    assert error(ShackHartmannModel(config, grid, paths)) < 1e-3
+    # The small-signal response is another one.
+    assert error(ShackHartmannModel(config, grid)) > 0.03

@@ -36,7 +36,7 @@ def test_ours_and_oopaos_sensor_give_the_same_matrix_and_ours_solves_it(alike, m
     answer = sprint.EscapeSolver(alike, modes).solver("registration-only", noise=False)(theirs)
     assert answer.valid
     error = np.abs(answer.registration.to_array() - sprint.INJECTED.to_array())
-    assert (error < [0.01, 0.01, 1e-4, 1e-3, 1e-3]).all()
+    assert (error < [0.01, 0.01, 1e-4, 3e-3, 3e-3]).all()
 
 
 def test_on_the_pyramid_both_solve_oopaos_matrix_and_ours_is_nearer():

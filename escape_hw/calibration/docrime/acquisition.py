@@ -178,9 +178,10 @@ class OpenLoopAcquisition:
         )
 
     def restore(self, state: RunState) -> None:
-        """Continue from a saved state."""
+        """Continue from a saved state; a pyramid is modulated first, for which its geometry was measured."""
         if state.grid is None:
             raise RuntimeError("a state without a geometry was saved")
+        prepare_sensor(self.bench)
         sensor = self._sensor = self._set_up_sensor(state.grid, state.arrays.get("mean_frame"))
         self.n_received, self._n_processed = int(state.values["taken"]), int(state.values["fed"])
         self.shortened = int(state.values["shortened"])

@@ -17,6 +17,9 @@ from escape_hw.errors import CalibrationError, ConfigError
 #: Relative anisotropy that separates pairs of modes with equal variance on a symmetric mirror, whose
 #: orientation would otherwise depend on rounding errors.
 _ANISOTROPY = 1e-4
+#: Mean square over the pupil per squared command, relative to the best, that a combination of actuators needs
+#: to be part of Karhunen-Loeve modes: commands up to thirty times larger.
+_LEAST_RESPONSE = 1e-3
 #: Ratio of singular values below which the surfaces of modes are linearly dependent.
 _MIN_SINGULAR_RATIO = 1e-3
 #: Outer scale of the turbulence assumed for the modal basis, in pupil diameters.
@@ -77,7 +80,8 @@ def karhunen_loeve(
     """Karhunen-Loeve modes of von Karman turbulence within the span of the influence functions.
 
     Double diagonalisation (Gendron 1995): modes that are orthonormal over the pupil without piston, with
-    uncorrelated coefficients of the turbulence, ordered by decreasing variance.
+    uncorrelated coefficients of the turbulence, ordered by decreasing variance; the first ``n_modes`` of
+    all that the mirror makes without large commands (:data:`_LEAST_RESPONSE`).
 
     Returns ``(n_act, n_modes)``, columns with unit rms surface over the pupil, signs fixed.
 
@@ -103,14 +107,17 @@ def karhunen_loeve(
     orthonormal = _orthonormal_modes(pupil_surfaces, pupil, n_modes)
     covariance = _turbulence_covariance(pupil_surfaces, pupil, pixel_m, outer_scale_m)
     variance, rotation = np.linalg.eigh(orthonormal.T @ covariance @ orthonormal)
-    m2c = orthonormal @ rotation[:, np.argsort(variance)[::-1]]
+    m2c = orthonormal @ rotation[:, np.argsort(variance)[::-1][:n_modes]]
     return fix_signs(scale_to_unit_rms(m2c, surfaces, pupil))
 
 
 def _orthonormal_modes(
     pupil_surfaces: NDArray[np.float64], pupil: NDArray[np.bool_], n_modes: int
 ) -> NDArray[np.float64]:
-    """Modes ``(n_act, n_modes)``, orthonormal over the pupil, that need the smallest commands."""
+    """Modes ``(n_act, n_modes or more)``, orthonormal over the pupil, that need the smallest commands.
+
+    More than ``n_modes``, because tip, tilt and focus need the actuators at the rim, which respond weakly.
+    """
     n_act = len(pupil_surfaces)
     gram = pupil_surfaces @ pupil_surfaces.T / pupil_surfaces.shape[1]
     rows, columns = np.nonzero(pupil)
@@ -127,7 +134,7 @@ def _orthonormal_modes(
             f"{n_modes} modes requested; this mirror of {n_act} actuators makes at most "
             f"{min(int(significant.sum()), n_act - 1)} without piston; lower basis.n_modes"
         )
-    order = np.argsort(values)[::-1][:n_modes]
+    order = np.argsort(values)[::-1][: max(n_modes, int((values > values[-1] * _LEAST_RESPONSE).sum()))]
     chosen = vectors[:, order] / np.sqrt(values[order])
     return np.asarray(np.linalg.solve(np.linalg.cholesky(chosen.T @ gram @ chosen), chosen.T).T)
 

@@ -6,7 +6,7 @@ mirror surfaces.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -47,7 +47,10 @@ _N_ORIENTATIONS = 8
 
 
 def slope_weights(
-    config: SystemConfig, grid: SubApertureGrid, pupil: PupilGeometry
+    config: SystemConfig,
+    grid: SubApertureGrid,
+    pupil: PupilGeometry,
+    wavefronts_m: Sequence[NDArray[np.floating]] = (),
 ) -> dict[tuple[int, int], NDArray[np.float64]]:
     """Mean derivative of each slope by the optical path on its lenslet and on the eight around it.
 
@@ -61,20 +64,48 @@ def slope_weights(
     (:func:`lenslet_turbulence`), which lifts the wings of the spots above the threshold; without it
     scalings would be underestimated.
 
+    With ``wavefronts_m``, optical paths ``(n, n)`` in metres over the pupil, the derivative is averaged over
+    these instead. Pokes of a mirror with about one actuator per lenslet are not tilts of whole lenslets
+    (docs/studies/lenslet-pokes.md).
+
     Returns
     -------
     dict
         For each step in :data:`NEIGHBOURS`: ``(2, n_valid, p, p)`` in pixels per metre, x then y.
     """
     window_images = _WindowImages(config, grid, pupil)
+    wave = 2 * np.pi / config.system.wavelength_m
+    if len(wavefronts_m):
+        return _mean_over_wavefronts(window_images, grid, pupil, wavefronts_m, wave)
     shifts = grid.motion_px * gaussian_lattice() if grid.motion_px else np.zeros((1, 2))
     blur = np.zeros((len(shifts), pupil.n_pix, pupil.n_pix))
     if grid.motion_px and grid.turbulence_px:
         blur = np.sqrt(_turbulence_strength(config, grid)) * lenslet_turbulence(pupil.n_pix)
     out = {step: np.zeros((2, grid.n_valid, pupil.n_pix, pupil.n_pix)) for step in NEIGHBOURS}
     for shift, phase in zip(shifts, blur, strict=True):
-        window_images.accumulate(out, shift, phase, 1 / len(shifts))
-    wave = 2 * np.pi / config.system.wavelength_m
+        moved = window_images.moved(shift, phase)
+        window_images.accumulate(out, dict.fromkeys(NEIGHBOURS, moved), 1 / len(shifts))
+    return {step: block * wave for step, block in out.items()}
+
+
+def _mean_over_wavefronts(
+    window_images: _WindowImages,
+    grid: SubApertureGrid,
+    pupil: PupilGeometry,
+    wavefronts_m: Sequence[NDArray[np.floating]],
+    wave: float,
+) -> dict[tuple[int, int], NDArray[np.float64]]:
+    """Weights of :func:`slope_weights`, averaged over wavefronts."""
+    n, p = pupil.n_sub, pupil.n_pix
+    out = {step: np.zeros((2, grid.n_valid, p, p)) for step in NEIGHBOURS}
+    rows, columns = np.nonzero(grid.valid)
+    for wavefront in wavefronts_m:
+        phase = wave * wavefront.reshape(n, p, n, p).transpose(0, 2, 1, 3)
+        phasor = np.exp(1j * phase).astype(np.complex64)
+        phasors = {
+            (i, j): phasor[np.clip(rows + i, 0, n - 1), np.clip(columns + j, 0, n - 1)] for i, j in NEIGHBOURS
+        }
+        window_images.accumulate(out, phasors, 1 / len(wavefronts_m))
     return {step: block * wave for step, block in out.items()}
 
 
@@ -179,14 +210,8 @@ class _WindowImages:
         matrix = lenslet_transform(centre, at[:, 0], p, size, self._spot) * reach[:, None, :]
         return matrix.astype(self._complex)
 
-    def accumulate(
-        self,
-        out: dict[tuple[int, int], NDArray[np.float64]],
-        shift: NDArray[np.float64],
-        phase: NDArray[np.float64],
-        share: float,
-    ) -> None:
-        """Add ``share`` times the derivatives for spots shifted by ``shift (2,)`` pixels and blurred.
+    def moved(self, shift: NDArray[np.float64], phase: NDArray[np.float64]) -> NDArray[np.complexfloating]:
+        """Phasors ``(n_valid, p, p)`` of spots shifted by ``shift (2,)`` pixels and blurred by ``phase``.
 
         Every window rotates the shift, and orients the blurring ``phase``, in its own way.
         """
@@ -197,12 +222,20 @@ class _WindowImages:
             np.exp(2j * np.pi * d[:, None] * self._samples / self._spot).astype(self._complex).conj()
             for d in (sine * along + cosine * across, cosine * along - sine * across)
         ]
-        phasor = tilt[0][:, :, None] * tilt[1][:, None, :] * blur
+        return np.asarray(tilt[0][:, :, None] * tilt[1][:, None, :] * blur)
+
+    def accumulate(
+        self,
+        out: dict[tuple[int, int], NDArray[np.float64]],
+        phasors: Mapping[tuple[int, int], NDArray[np.complexfloating]],
+        share: float,
+    ) -> None:
+        """Add ``share`` times the derivatives for the phasors ``(n_valid, p, p)`` of each neighbour."""
         fields = {}
         image = np.zeros(self._inside.shape, self._real)
         for step in NEIGHBOURS:
             fy, fx = self._along[step]
-            amplitude = self._blocks[step] * phasor
+            amplitude = self._blocks[step] * phasors[step]
             e = np.matmul(np.matmul(fy.transpose(0, 2, 1), amplitude), fx)
             image += e.real**2 + e.imag**2
             fields[step] = (amplitude, e)
@@ -371,7 +404,7 @@ class ShackHartmannModel(DesignModel):
 
     The centre of gravity of a spot is a smooth function of the phase on its lenslet. Its derivative is
     a fixed weight map per lenslet, so a matrix needs one small product per sub-aperture and no frames.
-    ``grid`` is the one measured on the camera.
+    ``grid`` is the one measured on the camera; ``wavefronts_m`` are those of :func:`slope_weights`.
 
     Raises
     ------
@@ -381,7 +414,12 @@ class ShackHartmannModel(DesignModel):
 
     name = "fast"
 
-    def __init__(self, config: SystemConfig, grid: SubApertureGrid) -> None:
+    def __init__(
+        self,
+        config: SystemConfig,
+        grid: SubApertureGrid,
+        wavefronts_m: Sequence[NDArray[np.floating]] = (),
+    ) -> None:
         super().__init__(config, pupil_geometry(config))
         if grid.valid.shape != (self._pupil.n_sub, self._pupil.n_sub):
             raise ValueError(
@@ -390,12 +428,14 @@ class ShackHartmannModel(DesignModel):
             )
         self._opd_per_command_m = 2 * config.devices.dm.stroke_m
         self._grid = grid
-        self._variants: list[ShackHartmannModel] | None = None
+        # The motion of the spots is known where their wavefronts are.
+        self._variants: list[ShackHartmannModel] | None = [] if len(wavefronts_m) else None
+        self._wavefronts_m = tuple(wavefronts_m)
 
     @cached_property
     def _slopes(self) -> SlopeOperator:
         """Slopes of wavefronts; the modal basis, for which models are made too, needs none."""
-        weights = slope_weights(self._config, self._grid, self._pupil)
+        weights = slope_weights(self._config, self._grid, self._pupil, self._wavefronts_m)
         return SlopeOperator(weights, self._grid.valid, self._pupil.sub_aperture_m)
 
     def influence_functions(self) -> tuple[NDArray[np.float64], NDArray[np.bool_], float]:
