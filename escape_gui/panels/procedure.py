@@ -250,7 +250,8 @@ class ProcedurePanel(Panel):
             return
         self._plan = plan
         warnings = [f"⚠ {one}" for one in plan.warnings]
-        self._show_plan("\n".join([*form_text.plan_lines(plan), *warnings]), "warn" if warnings else "text")
+        lines = form_text.plan_lines(plan, simulated=self._state.simulated)
+        self._show_plan("\n".join([*lines, *warnings]), "warn" if warnings else "text")
         self._enable()
 
     def ask_start(self) -> None:
