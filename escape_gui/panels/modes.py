@@ -80,6 +80,7 @@ class ModesPanel(Panel):
                 lambda _=False, step=step: self.mosaic.show_page(self.mosaic.page[0] + step)
             )
         self._page_label = QLabel()
+        self._page_label.setToolTip("Page of the modes")
         self._page_controls = (self._previous_button, self._page_label, self._next_button)
         self.body.addLayout(row(self.matrix_selector, self.weight_by_snr, None, *self._page_controls))
 
@@ -219,7 +220,7 @@ class ModesPanel(Panel):
         self._status_label.setText(f"{self._describe_mode(pixel.mode)}  {value}")
 
     def _show_page(self, page: int, pages: int) -> None:
-        self._page_label.setText(f"page {page + 1} of {pages}")
+        self._page_label.setText(f"{page + 1} of {pages}")
         for widget in self._page_controls:
             widget.setVisible(pages > 1)
         self._previous_button.setEnabled(page > 0)

@@ -81,7 +81,7 @@ class ProcedurePanel(Panel):
         ignore_wheel_without_focus(self.choice)
         self.choice.currentIndexChanged.connect(self._on_procedure_selected)
         self._description = text_label()
-        self.form = ArgumentForm()
+        self.form = ArgumentForm(self.choice)
         self.form.edited.connect(self._on_edit)
         self.plan = text_label()
         self.plan.setAccessibleName("Plan")

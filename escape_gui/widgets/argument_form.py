@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 
 from PySide6.QtCore import QSize, Qt, Signal
@@ -27,12 +28,16 @@ class ArgumentForm(QWidget):
     #: A value was changed.
     edited = Signal()
 
-    def __init__(self) -> None:
+    def __init__(self, previous: QWidget) -> None:
+        """``previous``: the widget from which the Tab key leads to the first field."""
         super().__init__()
+        self._previous = previous
         self._parameters: tuple[ProcedureParameter, ...] = ()
         self.fields: dict[str, QWidget] = {}
         self._matrices: tuple[str, ...] = ()
         self._area = scroll_area()
+        # The Tab key goes to the fields.
+        self._area.setFocusPolicy(Qt.FocusPolicy.NoFocus)
         self._area.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
         column(self._area, parent=self)
         # The next widget is directly below the last argument; on a small screen the form scrolls.
@@ -63,6 +68,9 @@ class ArgumentForm(QWidget):
             name.setBuddy(field)
             form.addRow(name, row((field, 1), *([caption(one.unit)] if one.unit else [])))
         self._area.setWidget(page)
+        # New widgets are the last ones in the window for the Tab key.
+        for before, after in itertools.pairwise((self._previous, *self.fields.values())):
+            QWidget.setTabOrder(before, after)
         self.updateGeometry()
 
     def set_matrix_choices(self, matrices: tuple[str, ...]) -> None:

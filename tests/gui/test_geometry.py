@@ -1,4 +1,4 @@
-"""The safety buttons and the last line are visible at any width from 1024 pixels."""
+"""The window from 1024 pixels: safety buttons, last line, titles and newest values are visible."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 import pytest
 from gui_windows import dispose, show_window
-from PySide6.QtCore import QPoint, QRect
-from PySide6.QtWidgets import QApplication, QWidget
+from PySide6.QtCore import QPoint, QRect, Qt
+from PySide6.QtWidgets import QApplication, QScrollArea, QTabBar, QWidget
 
 from escape_gui.client.session import Session
 from escape_gui.main_window import MainWindow
@@ -68,3 +68,28 @@ def test_the_layout_of_a_wide_screen_fits_a_narrow_one(show: Show) -> None:
     QApplication.processEvents()
     assert QRect(0, 0, 1024, 768).contains(window.geometry())
     check(window, 1016, 736)
+
+
+def wide_panels(window: MainWindow) -> set[str]:
+    """Visible panels that do not fit the width of their dock."""
+    areas = {name: dock.widget() for name, dock in window.docks.items() if not dock.visibleRegion().isEmpty()}
+    return {
+        name
+        for name, area in areas.items()
+        if isinstance(area, QScrollArea) and area.horizontalScrollBar().maximum() > 0
+    }
+
+
+@pytest.mark.parametrize("workspace", [one.name for one in WORKSPACES])
+def test_panels_and_their_tabs_fit_the_narrowest_window(workspace: str, show: Show) -> None:
+    window = show(Settings(workspace=workspace))
+    window.resize(1024, 700)
+    for _ in range(5):
+        window.update_timer.tick(force=True)
+        QApplication.processEvents()
+    assert wide_panels(window) == set()
+    for bar in window.findChildren(QTabBar, options=Qt.FindChildOption.FindDirectChildrenOnly):
+        if bar.isVisible() and bar.count():
+            assert bar.elideMode() is Qt.TextElideMode.ElideNone
+            last = bar.tabRect(bar.count() - 1)
+            assert bar.rect().contains(last), [bar.tabText(k) for k in range(bar.count())]

@@ -299,5 +299,5 @@ def test_a_missing_reference_psf_is_shown(make_window: MakeWindow, source: Scrip
     source.streams["model_psf"] = model
     source.change(streams=(StreamEntry(name="model_psf", segment="", unit=""),))
     window.update_timer.tick(force=True)
-    assert psf.captions["model_psf"].text() == "PSF: reference (dashed)"
+    assert psf.captions["model_psf"].text() == "PSF: reference (- -)"
     assert not performance.reference_missing_label.isVisible()
