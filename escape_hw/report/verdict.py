@@ -78,9 +78,8 @@ def _problems(document: Mapping[str, Any]) -> Iterator[Verdict]:
             yield Verdict(Quality.NOT_USABLE, f"not met: {text}", "see the report")
     yield from _noisy_modes(document)
     if document.get("partial"):
-        yield Verdict(
-            Quality.USABLE, "the run was aborted, the data measured so far are saved", "run it again"
-        )
+        after = f" after {frames:,} frames" if _is_number(frames := document.get("frames")) else ""
+        yield Verdict(Quality.USABLE, f"the run was aborted{after}", "run it again")
     warnings = document.get("warnings")
     for warning in warnings if isinstance(warnings, list | tuple) else ():
         yield Verdict(Quality.USABLE, str(warning), "see the report")

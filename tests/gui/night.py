@@ -187,12 +187,15 @@ class Night:
 
     def take_over(self) -> None:
         """A second window takes control, closes, and the first one takes it back with its button."""
+        if self.state.loop.closed:
+            self.open()
+        self.key(Qt.Key.Key_2, Qt.KeyboardModifier.ControlModifier)
         banner = self.window.control_banner
         with operator_window(self.state.system, workspace="operate") as second:
             other = second.window
             second.until(lambda: other.context.session.source.state.phase is Phase.IDLE, "it is connected")
             assert not other.context.session.may_write
-            assert "has control" in other.header.control.text
+            second.until(lambda: "has control" in other.header.control.text, "it says who has control")
             self.key(Qt.Key.Key_L, Qt.KeyboardModifier.ControlModifier, other)
             second.until(lambda: other.context.session.may_write, "it has control")
             self.operator.until(lambda: "has control" in self.window.header.control.text, "the first is told")

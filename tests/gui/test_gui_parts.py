@@ -114,7 +114,7 @@ def test_sound_settings_survive_beside_damaged_ones(tmp_path: Path) -> None:
 
 
 def test_a_missing_settings_file_gives_no_warning(tmp_path: Path) -> None:
-    assert load_settings(tmp_path / "none.json") == (Settings(), ())
+    assert load_settings(tmp_path / "none.json") == (Settings(workspace="align"), ())
 
 
 # ---------------------------------------------------------------- requests

@@ -23,7 +23,7 @@ ESCAPE = {"converged": True, "iterations": 15, "frames": 600, "snr": {"min": 23.
         ({"converged": None, "snr": {"min": 2.0}}, Quality.USABLE, "measure about 1,400 frames"),
         ({"criteria": [{"text": "loop stable", "met": False}]}, Quality.NOT_USABLE, "not met: loop stable"),
         ({"warnings": ["scaling beyond 5 %"]}, Quality.USABLE, "scaling beyond 5 %; see the report"),
-        ({"partial": True}, Quality.USABLE, "aborted"),
+        ({"partial": True}, Quality.USABLE, "Usable: the run was aborted after 600 frames; run it again"),
         ({"alarms": [{}, {"text": "jumped"}]}, Quality.USABLE, "2 alarms, the last: jumped; see the report"),
         ({"stable": False}, Quality.NOT_USABLE, "the loop was not stable; lower the gain"),
         (
