@@ -12,7 +12,6 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from escape_hw.config.key_tree import closest_match
 from escape_hw.io.storage import write_atomic
 
-
 #: Workspace that the window shows when it is opened for the first time.
 FIRST_WORKSPACE = "align"
 

@@ -257,6 +257,8 @@ class ProcedurePanel(Panel):
     def ask_start(self) -> None:
         session, name, arguments = self.context.session, self.chosen, self._checked_arguments
         if session.control is not None and self._plan is not None and arguments is not None:
+            # A disabled button passes its focus on to the next widget, whatever it is.
+            self.choice.setFocus()
             self.start.setEnabled(False)
             session.ask(f"start {self.choice.currentText()}", lambda server: server.start(name, **arguments))
 

@@ -68,9 +68,7 @@ class SprintPanel(Panel):
         self.units = flat_button("Units", tip, checkable=True)
         self.units.setShortcut("U")
         self.units.toggled.connect(self.plot.set_physical_units)
-        corner = QWidget()
-        row(self._indicator, self.units, parent=corner).setContentsMargins(0, 0, 0, 2)
-        self.tabs.setCornerWidget(corner)
+        self.tabs.setCornerWidget(self.units)
         table = QGridLayout()
         table.setHorizontalSpacing(6)
         table.setVerticalSpacing(0)
@@ -83,7 +81,9 @@ class SprintPanel(Panel):
         self._notes = text_label()
         self._notes.hide()
         page = QWidget()
-        column((self.plot, 1), table, self._notes, parent=page).setContentsMargins(0, 4, 0, 0)
+        column(
+            row(self._indicator, None), (self.plot, 1), table, self._notes, parent=page, spacing=4
+        ).setContentsMargins(0, 4, 0, 0)
         self.apply_theme()
         return page
 

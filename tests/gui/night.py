@@ -266,7 +266,7 @@ class Night:
         self.key(Qt.Key.Key_3, Qt.KeyboardModifier.ControlModifier)
         self.operator.press(self.log.copy_button)
         text = QApplication.clipboard().text()
-        for event in ("loop closed", "loop opened", "engine"):
+        for event in ("loop closed", "the loop is opened", "has control"):
             assert event in text.lower(), f"{event} is not in the log:\n{text}"
         if self.folder is not None:
             (self.folder / "night.txt").write_text(text)

@@ -4,17 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import fake_results as fake
+import numpy as np
 import pytest
 from gui_windows import dispose, show_window
 from PySide6.QtCore import QPoint, QRect, Qt
 from PySide6.QtWidgets import QApplication, QScrollArea, QTabBar, QWidget
+from scripted import ScriptedSource
 
 from escape_gui.client.session import Session
 from escape_gui.main_window import MainWindow
 from escape_gui.settings import Settings
 from escape_gui.window.docks import WORKSPACES
+from escape_hw.api.registration import TO_STREAM_UNITS
+from escape_hw.io.documents import calibration_document
+from escape_hw.remote.state import Finish, FinishedRun
 
 Show = Callable[[Settings], MainWindow]
+RESULT = fake.calibration("escape", n=8, n_modes=6)
 
 
 @pytest.fixture
@@ -81,9 +88,17 @@ def wide_panels(window: MainWindow) -> set[str]:
 
 
 @pytest.mark.parametrize("workspace", [one.name for one in WORKSPACES])
-def test_panels_and_their_tabs_fit_the_narrowest_window(workspace: str, show: Show) -> None:
+def test_panels_and_their_tabs_fit_the_narrowest_window(
+    workspace: str, show: Show, source: ScriptedSource
+) -> None:
     window = show(Settings(workspace=workspace))
     window.resize(1024, 700)
+    # With a registration, and without a Strehl ratio.
+    path = np.array([step.registration.to_array() for step in fake.registration().iterations])
+    source.push("registration", (path * TO_STREAM_UNITS).astype(np.float32))
+    ended = FinishedRun(id=3, name="escape", finish=Finish.DONE, document=calibration_document(RESULT))
+    loop = source.state.loop.model_copy(update={"strehl": None})
+    source.change(last_run=ended, loop=loop)
     for _ in range(5):
         window.update_timer.tick(force=True)
         QApplication.processEvents()
