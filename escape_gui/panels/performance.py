@@ -53,7 +53,7 @@ class PerformancePanel(Panel):
         self.span = SegmentedButton("Time span", tuple(SPANS_S), ["Show the last time span"] * len(SPANS_S))
         self.span.chosen.connect(self._on_span_chosen)
         self.body.addLayout(row(*self.readouts.values(), None, spacing=24))
-        self.body.addLayout(row(self.span, (self.reference_missing_label, 1)))
+        self.body.addLayout(row(self.span, (self.reference_missing_label, 1), None))
         self.body.addWidget(self.strehl, 1)
         self.body.addWidget(self.residual, 1)
         self._last_drawn_s = 0.0

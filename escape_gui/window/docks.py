@@ -155,8 +155,8 @@ WORKSPACES: tuple[Workspace, ...] = (
             # Form, plan and result fill a column of a small screen.
             Column((Cell(("procedure",)),), 0.95),
             # The mosaic and the detail of a mode share a column.
-            Column((Cell(("modes",)),), 1.2),
-            Column((Cell(("sprint",), 1.3), Cell(("gains", "camera", "devices", "log"), 1.0)), 1.25),
+            Column((Cell(("modes",)),), 1.25),
+            Column((Cell(("sprint",), 1.3), Cell(("gains", "camera", "devices", "log"), 1.0)), 1.2),
         ),
     ),
     Workspace(

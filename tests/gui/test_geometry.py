@@ -18,10 +18,20 @@ from escape_gui.settings import Settings
 from escape_gui.window.docks import WORKSPACES
 from escape_hw.api.registration import TO_STREAM_UNITS
 from escape_hw.io.documents import calibration_document
-from escape_hw.remote.state import Finish, FinishedRun
+from escape_hw.remote.state import Finish, FinishedRun, ProcedureEntry, ProcedureParameter
 
 Show = Callable[[Settings], MainWindow]
 RESULT = fake.calibration("escape", n=8, n_modes=6)
+MATRIX = fake.matrix("docrime-whitened", n=24, n_modes=30)
+ESCAPE = ProcedureEntry(
+    name="escape", title="ESCAPE", help="Measure, fit, compute.",
+    parameters=(
+        ProcedureParameter(name="accuracy", kind="float", unit="% of a sub-aperture", label="Accuracy goal"),
+        ProcedureParameter(name="pokes", kind="choice", default="white", choices=("white", "anticorrelated")),
+        ProcedureParameter(name="whiten", kind="bool", default=True, label="Whiten turbulence"),
+        ProcedureParameter(name="closed_loop", kind="matrix"),
+    ),
+)  # fmt: skip
 
 
 @pytest.fixture
@@ -91,10 +101,13 @@ def wide_panels(window: MainWindow) -> set[str]:
 def test_panels_and_their_tabs_fit_the_narrowest_window(
     workspace: str, show: Show, source: ScriptedSource
 ) -> None:
+    source.entries = (ESCAPE,)
     window = show(Settings(workspace=workspace))
     window.resize(1024, 700)
     # With a registration, and without a Strehl ratio.
     path = np.array([step.registration.to_array() for step in fake.registration().iterations])
+    source.push("valid", MATRIX.valid.astype(np.float32))
+    source.push("matrix", MATRIX.data, method="docrime")
     source.push("registration", (path * TO_STREAM_UNITS).astype(np.float32))
     ended = FinishedRun(id=3, name="escape", finish=Finish.DONE, document=calibration_document(RESULT))
     loop = source.state.loop.model_copy(update={"strehl": None})
@@ -103,6 +116,8 @@ def test_panels_and_their_tabs_fit_the_narrowest_window(
         window.update_timer.tick(force=True)
         QApplication.processEvents()
     assert wide_panels(window) == set()
+    form = window.panels["procedure"].form
+    assert form._area.horizontalScrollBar().maximum() == 0
     for bar in window.findChildren(QTabBar, options=Qt.FindChildOption.FindDirectChildrenOnly):
         if bar.isVisible() and bar.count():
             assert bar.elideMode() is Qt.TextElideMode.ElideNone
