@@ -34,6 +34,8 @@ log = logging.getLogger(__name__)
 DEFAULT_SYSTEM = "razor-shwfs"
 #: Delay between a ready engine and the screenshot, and longest wait for the engine; milliseconds.
 _SCREENSHOT_DELAY_MS, _SCREENSHOT_TIMEOUT_MS = 4000, 60_000
+#: Title of the message without a server; it is closed when one answers.
+_NO_SERVER = "No server"
 _ICON = Path(__file__).with_name("escape.svg")
 #: Niceness of the window's process, so that a loop on the same computer takes precedence.
 _NICENESS = 10
@@ -88,6 +90,7 @@ class WindowController(QObject):
     def _attached(self, live: LiveSource) -> None:
         old, self._live = self._live, live
         self.session.set_source(live, live.connection)
+        self.window.notifications.close_messages(_NO_SERVER)
         if old is not None:
             self.attachment.discard(old)
         if self.local_server is not None:
@@ -95,7 +98,7 @@ class WindowController(QObject):
 
     def _connection_failed(self, reason: str) -> None:
         if self.local_server is None:
-            self.window.notifications.show_message(Level.ERROR, "No server", reason)
+            self.window.notifications.show_message(Level.ERROR, _NO_SERVER, reason)
         elif exit_message := self.local_server.exit_message:
             self.window.notifications.show_message(Level.ERROR, "The server did not start", exit_message)
 

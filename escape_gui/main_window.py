@@ -36,7 +36,7 @@ from escape_gui.widgets.controls import Level, Overlay, column
 from escape_gui.window.actions import ACTIONS, MENUS, format_shortcuts, help_page, keyboard_table
 from escape_gui.window.alarm_dialog import AlarmDialog
 from escape_gui.window.closing import CloseQuestion, is_busy
-from escape_gui.window.docks import WORKSPACES, Dock, arrange_docks, hide_orphan_tab_bars, workspace
+from escape_gui.window.docks import WORKSPACES, Dock, arrange_docks, arrange_tab_bars, workspace
 from escape_gui.window.export import Exporter
 from escape_gui.window.header import AlarmBanner, ControlBanner, FaultBanner, FrozenBanner, HeaderBar
 from escape_gui.window.notifications import NotificationBar, StateNotifier
@@ -252,7 +252,7 @@ class MainWindow(QMainWindow):
         if stored is None or not self.restoreState(_bytes(stored), LAYOUT_VERSION):
             arrange_docks(self, docks, self.workspace)
         self.resize(size)
-        hide_orphan_tab_bars(self, docks)
+        arrange_tab_bars(self, docks)
         if self.isVisible() and not (self.isMaximized() or self.isFullScreen()):
             # The layout of a larger window must not enlarge this one when Qt calculates its least size later.
             QTimer.singleShot(0, self, lambda: self.resize(self.size().boundedTo(size)))
@@ -267,6 +267,8 @@ class MainWindow(QMainWindow):
         self.workspace = workspace(name)
         self._apply_layout()
         self.tabs.setCurrentIndex(WORKSPACES.index(self.workspace))
+        # Otherwise Qt passes the focus of a panel that is hidden now to the next widget, whatever it is.
+        self.setFocus()
 
     def reset_layout(self) -> None:
         self._settings.layouts.pop(self.workspace.name, None)

@@ -12,6 +12,9 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from escape_hw.config.key_tree import closest_match
 from escape_hw.io.storage import write_atomic
 
+#: Workspace that the window shows when it is opened for the first time.
+FIRST_WORKSPACE = "align"
+
 
 class Settings(BaseModel):
     """Theme, font size and layouts."""
@@ -40,7 +43,8 @@ def load_settings(path: Path) -> tuple[Settings, tuple[str, ...]]:
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
-        return Settings(), ()
+        # The first start: look at the devices and the light.
+        return Settings(workspace=FIRST_WORKSPACE), ()
     except (OSError, ValueError) as error:
         return Settings(), (f"{path}: cannot be read ({error}); using the default settings",)
     if not isinstance(content, dict):

@@ -32,6 +32,14 @@ def has_postgres() -> bool:
 
 QT = ("libEGL.so.1", "libGL.so.1", "libxkbcommon.so.0", "libfontconfig.so.1", "libdbus-1.so.3")
 QT_PACKAGES = ("libegl1", "libgl1", "libxkbcommon0", "libfontconfig1", "libdbus-1-3")
+X11 = (
+    "libxcb-cursor.so.0", "libxcb-icccm.so.4", "libxcb-image.so.0", "libxcb-keysyms.so.1",
+    "libxcb-render-util.so.0", "libxkbcommon-x11.so.0",
+)  # fmt: skip
+X11_PACKAGES = (
+    "xvfb", "libxcb-cursor0", "libxcb-icccm4", "libxcb-image0", "libxcb-keysyms1", "libxcb-render-util0",
+    "libxkbcommon-x11-0",
+)  # fmt: skip
 #: What the tests need, how to look for it, and the packages of Debian that bring it.
 NEEDED: tuple[tuple[str, Callable[[], object], tuple[str, ...]], ...] = (
     (
@@ -42,6 +50,11 @@ NEEDED: tuple[tuple[str, Callable[[], object], tuple[str, ...]], ...] = (
     ("PostgreSQL, for sweeps of several computers", has_postgres, ("postgresql",)),
     ("Aravis with its fake camera", lambda: can_load("libaravis-0.8.so.0"), ("libaravis-0.8-0",)),
     ("libraries that Qt loads, for the window", lambda: can_load(*QT), QT_PACKAGES),
+    (
+        "Xvfb and the libraries of Qt for X11, for a night of operation on a display",
+        lambda: shutil.which("Xvfb") and can_load(*X11),
+        X11_PACKAGES,
+    ),
     ("setpriv, to run commands as another user", lambda: shutil.which("setpriv"), ("util-linux",)),
 )
 

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from datetime import datetime
 
+from escape_hw.api.tracking import DRIFT
 from escape_hw.remote.state import State
 
 log = logging.getLogger(__name__)
@@ -56,12 +57,18 @@ def _saturation(state: State) -> float | None:
     return 100 * state.illumination.saturated
 
 
+def _drift(state: State) -> float | None:
+    """Of the registration, while the tracker runs."""
+    return None if state.active_run is None else state.active_run.metrics.get(DRIFT)
+
+
 #: The rules, in the order of the dialog.
 RULES = (
     AlarmRule("strehl", "Strehl ratio", "%", True, 0, 100, 20, _strehl),
     AlarmRule("residual", "Residual", "nm rms", False, 0, 10_000, 200, _residual),
     AlarmRule("lost", "Lost frames", "frames", False, 0, 1_000_000, 100, _lost_frames),
     AlarmRule("saturated", "Saturated pixels", "%", False, 0, 100, 1, _saturation),
+    AlarmRule("drift", "Registration drift", "% of a sub-aperture", False, 0, 10_000, 20, _drift),
 )
 
 

@@ -59,6 +59,8 @@ class Panel(QWidget):
     #: One lower-case word: name of the dock, of the help page and of exported files.
     name: ClassVar[str]
     title: ClassVar[str]
+    #: Title of the tab if the panel lies behind another one; default: the title.
+    tab_title: ClassVar[str] = ""
     #: Two or three sentences on content and use.
     help: ClassVar[str]
     #: Streams to read; only new entries are passed to :meth:`on_sample`.

@@ -43,6 +43,7 @@ class CameraPanel(Panel):
 
     name: ClassVar[str] = "camera"
     title: ClassVar[str] = "Sensor camera"
+    tab_title: ClassVar[str] = "Sensor"
     help: ClassVar[str] = (
         "Frames of the wavefront sensor, or the slopes computed from them. Saturated pixels are hatched and "
         "counted. 'Set reference' stores the current frame; 'difference' shows later frames minus it."

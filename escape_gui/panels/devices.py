@@ -87,7 +87,8 @@ class _DeviceRow(QFrame):
             " · ".join(part for part in (device.model or device.kind, device.serial, mode) if part)
         )
         facts = "   ".join(
-            format_fact(key, value).replace(" ", _NO_BREAK_SPACE) for key, value in device.facts.items()
+            format_fact(key, value, simulated=device.simulated).replace(" ", _NO_BREAK_SPACE)
+            for key, value in device.facts.items()
         )
         self._facts.setText("\n".join(line for line in (facts, device.message) if line))
         self._facts.setVisible(bool(facts or device.message))
@@ -98,8 +99,13 @@ class _DeviceRow(QFrame):
         self._facts.setFont(self._theme.font(0.95, mono=True))
 
 
-def format_fact(key: str, value: float | str) -> str:
-    """A reading with its unit: ``temperature_c: 31.24`` becomes ``temperature 31.2 °C``."""
+def format_fact(key: str, value: float | str, *, simulated: bool = False) -> str:
+    """A reading with its unit: ``temperature_c: 31.24`` becomes ``temperature 31.2 °C``.
+
+    Rates of a simulated device are those of its own clock, and are marked.
+    """
+    if simulated and key.endswith("rate_hz"):
+        key = f"simulated_{key}"
     for suffix, (unit, digits) in _UNITS.items():
         if key.endswith(suffix) and not isinstance(value, str):
             return f"{key.removesuffix(suffix).replace('_', ' ')} {value:.{digits}f} {unit}"

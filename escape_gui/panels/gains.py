@@ -23,6 +23,7 @@ class GainsPanel(Panel):
 
     name = "gains"
     title = "Optical gains"
+    tab_title: ClassVar[str] = "Gains"
     help = (
         "Sensitivity of the sensor in operation, by mode, relative to each matrix: measured gains with error "
         "bars, and their trend over the modes. Matrices with gains below 1 are on the left axis, those above "

@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 from PySide6.QtCore import Qt
 from PySide6.QtGui import QKeyEvent, QResizeEvent
-from PySide6.QtWidgets import QCheckBox, QComboBox, QLabel, QPushButton, QSizePolicy, QSplitter, QWidget
+from PySide6.QtWidgets import QCheckBox, QComboBox, QLabel, QSizePolicy, QSplitter, QWidget
 
 from escape_gui.client.product_library import LoadedProducts
 from escape_gui.panels.base import Context, ExportArray, Panel
 from escape_gui.views.mode_maps import LIMIT, tiles
-from escape_gui.widgets.controls import row
+from escape_gui.widgets.controls import flat_button, row
 from escape_gui.widgets.mode_maps import DIVERGING, ColourScale, MapTiles, ModeMosaic, MosaicPixel
 from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.remote.source import DataSource, Sample
@@ -69,17 +69,14 @@ class ModesPanel(Panel):
         self.weight_by_snr.setChecked(True)
         self.weight_by_snr.setToolTip("Scale the colours of a mode by SNR² / (1 + SNR²).")
         self.weight_by_snr.toggled.connect(self._show_mosaic)
-        self._previous_button, self._next_button = QPushButton("‹"), QPushButton("›")
-        for button, step, name, key in (
-            (self._previous_button, -1, "Previous page", "Page Up"),
-            (self._next_button, 1, "Next page", "Page Down"),
-        ):
-            button.setToolTip(f"{name} ({key})")
-            button.setAccessibleName(name)
+        self._previous_button = flat_button("‹", "Previous page (Page Up)")
+        self._next_button = flat_button("›", "Next page (Page Down)")
+        for button, step in ((self._previous_button, -1), (self._next_button, 1)):
             button.clicked.connect(
                 lambda _=False, step=step: self.mosaic.show_page(self.mosaic.page[0] + step)
             )
         self._page_label = QLabel()
+        self._page_label.setToolTip("Page of the modes")
         self._page_controls = (self._previous_button, self._page_label, self._next_button)
         self.body.addLayout(row(self.matrix_selector, self.weight_by_snr, None, *self._page_controls))
 
@@ -219,7 +216,7 @@ class ModesPanel(Panel):
         self._status_label.setText(f"{self._describe_mode(pixel.mode)}  {value}")
 
     def _show_page(self, page: int, pages: int) -> None:
-        self._page_label.setText(f"page {page + 1} of {pages}")
+        self._page_label.setText(f"{page + 1} of {pages}")
         for widget in self._page_controls:
             widget.setVisible(pages > 1)
         self._previous_button.setEnabled(page > 0)

@@ -45,13 +45,15 @@ class PerformancePanel(Panel):
             "strehl": Readout(theme, "Strehl", "%", 12),
             "residual": Readout(theme, "residual", "nm rms", 7),
         }
-        self.reference_missing_label = caption(NO_REFERENCE)
+        self.reference_missing_label = caption(f"{NO_REFERENCE}: run Model PSF")
+        # In two lines where there is little room; the newest values stay visible.
+        self.reference_missing_label.setWordWrap(True)
         self.reference_missing_label.setToolTip(NO_REFERENCE_TIP)
         self.reference_missing_label.hide()
         self.span = SegmentedButton("Time span", tuple(SPANS_S), ["Show the last time span"] * len(SPANS_S))
         self.span.chosen.connect(self._on_span_chosen)
         self.body.addLayout(row(*self.readouts.values(), None, spacing=24))
-        self.body.addLayout(row(self.span, self.reference_missing_label, None))
+        self.body.addLayout(row(self.span, (self.reference_missing_label, 1), None))
         self.body.addWidget(self.strehl, 1)
         self.body.addWidget(self.residual, 1)
         self._last_drawn_s = 0.0

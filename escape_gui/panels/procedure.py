@@ -81,7 +81,7 @@ class ProcedurePanel(Panel):
         ignore_wheel_without_focus(self.choice)
         self.choice.currentIndexChanged.connect(self._on_procedure_selected)
         self._description = text_label()
-        self.form = ArgumentForm()
+        self.form = ArgumentForm(self.choice)
         self.form.edited.connect(self._on_edit)
         self.plan = text_label()
         self.plan.setAccessibleName("Plan")
@@ -250,12 +250,15 @@ class ProcedurePanel(Panel):
             return
         self._plan = plan
         warnings = [f"⚠ {one}" for one in plan.warnings]
-        self._show_plan("\n".join([*form_text.plan_lines(plan), *warnings]), "warn" if warnings else "text")
+        lines = form_text.plan_lines(plan, simulated=self._state.simulated)
+        self._show_plan("\n".join([*lines, *warnings]), "warn" if warnings else "text")
         self._enable()
 
     def ask_start(self) -> None:
         session, name, arguments = self.context.session, self.chosen, self._checked_arguments
         if session.control is not None and self._plan is not None and arguments is not None:
+            # A disabled button passes its focus on to the next widget, whatever it is.
+            self.choice.setFocus()
             self.start.setEnabled(False)
             session.ask(f"start {self.choice.currentText()}", lambda server: server.start(name, **arguments))
 

@@ -17,9 +17,9 @@ from escape_hw.remote.source import Sample
 
 #: Lower limit of the profiles, relative to the peak of the reference.
 _MIN_PROFILE = 1e-4
-CAPTIONS = {"psf": "PSF: measured (solid)", "model_psf": "PSF: reference (dashed)"}
+CAPTIONS = {"psf": "PSF: measured (—)", "model_psf": "PSF: reference (- -)"}
 #: Caption and tooltip if there is no reference.
-NO_REFERENCE = "no reference PSF: run model-psf"
+NO_REFERENCE = "no reference PSF"
 NO_REFERENCE_TIP = "The Strehl ratio is relative to the peak of the reference PSF; 'Model PSF' measures it"
 
 

@@ -7,11 +7,19 @@ from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
-from PySide6.QtWidgets import QGridLayout, QLabel, QPushButton, QTabWidget, QWidget
+from PySide6.QtWidgets import QGridLayout, QLabel, QTabWidget, QWidget
 
 from escape_gui.panels.base import Context, ExportArray, Panel
 from escape_gui.views.convergence import NAMES, UNITS, ConvergenceHistory, RegistrationDrift, short_unit
-from escape_gui.widgets.controls import QUALITY_LEVELS, Level, StatusIndicator, column, row, text_label
+from escape_gui.widgets.controls import (
+    QUALITY_LEVELS,
+    Level,
+    StatusIndicator,
+    column,
+    flat_button,
+    row,
+    text_label,
+)
 from escape_gui.widgets.plots import MARKERS, ConvergencePlot, DriftPlot
 from escape_gui.widgets.profile_plot import ProfilePlot
 from escape_hw.api.registration import PARAMETERS
@@ -60,16 +68,13 @@ class SprintPanel(Panel):
 
     def _make_convergence(self) -> QWidget:
         self._indicator = StatusIndicator(self.context.theme)
-        self.units = QPushButton("Units")
-        self.units.setCheckable(True)
-        self.units.setToolTip("Parameters in their physical units, or normalised on one axis (U).")
+        tip = "Parameters in their physical units, or normalised on one axis (U)."
+        self.units = flat_button("Units", tip, checkable=True)
         self.units.setShortcut("U")
         self.units.toggled.connect(self.plot.set_physical_units)
-        corner = QWidget()
-        row(self._indicator, self.units, parent=corner).setContentsMargins(0, 0, 0, 2)
-        self.tabs.setCornerWidget(corner)
+        self.tabs.setCornerWidget(self.units)
         table = QGridLayout()
-        table.setHorizontalSpacing(8)
+        table.setHorizontalSpacing(6)
         table.setVerticalSpacing(0)
         self._markers = [QLabel(MARKERS[k][1]) for k in range(len(PARAMETERS))]
         self._values = [QLabel("–") for _ in PARAMETERS]
@@ -80,7 +85,9 @@ class SprintPanel(Panel):
         self._notes = text_label()
         self._notes.hide()
         page = QWidget()
-        column((self.plot, 1), table, self._notes, parent=page).setContentsMargins(0, 4, 0, 0)
+        column(
+            row(self._indicator, None), (self.plot, 1), table, self._notes, parent=page, spacing=4
+        ).setContentsMargins(0, 4, 0, 0)
         self.apply_theme()
         return page
 

@@ -21,7 +21,14 @@ from escape_hw.remote.state import (
     ProductEntry,
 )
 from escape_hw.report.tables import TITLES, format_with_error
+from escape_hw.report.verdict import strehl_ratio
 
+#: Results that are single numbers, in the order of display: key of the document, words, unit.
+_SINGLE_VALUES = (
+    ("n_sub_apertures", "Sub-apertures", ""), ("counts", "Counts per sub-aperture", ""),
+    ("background", "Background", " counts"), ("peak", "Peak", " counts"), ("total", "Total", " counts"),
+    ("delay_frames", "Delay", " frames"),
+)  # fmt: skip
 #: Entry of a list of choices for an argument without a value.
 NO_CHOICE = "–"
 
@@ -98,12 +105,13 @@ def format_duration(seconds: float) -> str:
     return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d} min"
 
 
-def plan_lines(plan: ProcedurePlan) -> list[str]:
+def plan_lines(plan: ProcedurePlan, *, simulated: bool = False) -> list[str]:
     """A plan in two lines: what it takes, and how far the mirror moves."""
+    rate = "simulated frame rate of the camera" if simulated else "camera's frame rate"
     stroke = f"poke amplitude up to {100 * plan.stroke:.3g} % of stroke" if plan.stroke else "no pokes"
     if not plan.frames:
         return ["no frames needed: computed from existing data", ""]
-    return [f"{plan.frames} frames, {format_duration(plan.seconds)} at the camera's frame rate", stroke]
+    return [f"{plan.frames} frames, {format_duration(plan.seconds)} at the {rate}", stroke]
 
 
 def progress_line(running: ActiveRun) -> str:
@@ -142,20 +150,53 @@ def result_line(ended: FinishedRun) -> str:
 def comparison_lines(now: Mapping[str, Any], before: Mapping[str, Any] | None) -> list[str]:
     """Results of a run beside those of the previous one, from their documents (``result.json``)."""
     lines = _registration_lines(now, before)
-    for key, words, unit in (("gain", "Gain of the matrix", ""), ("residual_rms_nm", "Residual", " nm rms")):
+    # A loop has a gain too.
+    gain = "Gain of the loop" if "residual_rms_nm" in now else "Gain of the matrix"
+    numbers = (("gain", gain, ""), ("residual_rms_nm", "Residual", " nm rms"), *_SINGLE_VALUES)
+    for key, words, unit in numbers:
         value = now.get(key)
         if isinstance(value, int | float):
             lines.append(f"{words}: {value:.4g}{unit}{_change(value, (before or {}).get(key), unit)}")
+    lines += _gains_lines(now)
     snr, old = now.get("snr") or {}, (before or {}).get("snr") or {}
     if isinstance(snr.get("min"), int | float):
         lines.append(f"SNR of the worst mode: {snr['min']:.3g}{_change(snr['min'], old.get('min'), '')}")
     clipped, frames = now.get("clipped_pokes"), now.get("frames")
     if isinstance(clipped, int | float) and frames:
         lines.append(f"Pokes clipped: {100 * clipped / frames:.2g} % ({clipped:.0f} of {frames})")
-    strehl = now.get("strehl")
-    if isinstance(strehl, dict) and strehl.get("peak"):
-        lines.append(f"Strehl ratio: {100 * strehl['peak']['value']:.1f} %")
+    if (strehl := strehl_ratio(now)) is not None:
+        last = strehl_ratio(before or {})
+        change = "" if last is None else f" (before: {100 * last:.1f} %)"
+        lines.append(f"Strehl ratio: {100 * strehl:.1f} %{change}")
+    if frames:
+        lines.append(_frames_line(now))
     return lines
+
+
+def _gains_lines(now: Mapping[str, Any]) -> list[str]:
+    """Mean and range of the optical gains, and the exchanges of a track."""
+    lines = []
+    gains = np.asarray([one for one in now.get("optical_gain") or () if one is not None], float)
+    if gains.size:
+        lines.append(f"Optical gain: mean {gains.mean():.3f}, {gains.min():.3f} to {gains.max():.3f}")
+    if "exchanges" in now:
+        accepted = sum(bool(one.get("accepted")) for one in now["exchanges"])
+        lines.append(f"Matrix exchanged: {accepted} of {len(now['exchanges'])} proposals")
+        lines.append(f"Alarms: {len(now.get('alarms') or ())}")
+    return lines
+
+
+def _frames_line(now: Mapping[str, Any]) -> str:
+    """Frames, time and lost frames; the time of a twin is that of its own clock."""
+    seconds, lost = now.get("sky_seconds"), now.get("lost_frames")
+    if not isinstance(seconds, int | float) and now.get("rate_hz"):
+        seconds = now["frames"] / now["rate_hz"]
+    parts = [f"Frames: {now['frames']:,}"]
+    if isinstance(seconds, int | float):
+        parts.append(f"{format_duration(seconds)}{' (simulated)' if now.get('simulated') else ''}")
+    if isinstance(lost, int | float):
+        parts.append(f"{lost} lost")
+    return ", ".join(parts)
 
 
 def _registration_lines(now: Mapping[str, Any], before: Mapping[str, Any] | None) -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 
 from PySide6.QtCore import QSize, Qt, Signal
@@ -16,9 +17,13 @@ from PySide6.QtWidgets import (
 )
 
 from escape_gui.views import procedure_form as form_text
+from escape_gui.views.convergence import short_unit
 from escape_gui.widgets.controls import caption, column, row, scroll_area
 from escape_gui.widgets.inputs import ignore_wheel_without_focus
 from escape_hw.remote.state import Arguments, ProcedureParameter
+
+#: Letters of a field that are visible in a narrow window.
+_LEAST_LETTERS = 6
 
 
 class ArgumentForm(QWidget):
@@ -27,12 +32,16 @@ class ArgumentForm(QWidget):
     #: A value was changed.
     edited = Signal()
 
-    def __init__(self) -> None:
+    def __init__(self, previous: QWidget) -> None:
+        """``previous``: the widget from which the Tab key leads to the first field."""
         super().__init__()
+        self._previous = previous
         self._parameters: tuple[ProcedureParameter, ...] = ()
         self.fields: dict[str, QWidget] = {}
         self._matrices: tuple[str, ...] = ()
         self._area = scroll_area()
+        # The Tab key goes to the fields.
+        self._area.setFocusPolicy(Qt.FocusPolicy.NoFocus)
         self._area.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
         column(self._area, parent=self)
         # The next widget is directly below the last argument; on a small screen the form scrolls.
@@ -61,8 +70,11 @@ class ArgumentForm(QWidget):
             name = QLabel(form_text.label(one))
             name.setToolTip(form_text.parameter_hint(one))
             name.setBuddy(field)
-            form.addRow(name, row((field, 1), *([caption(one.unit)] if one.unit else [])))
+            form.addRow(name, row((field, 1), *([caption(short_unit(one.unit))] if one.unit else [])))
         self._area.setWidget(page)
+        # New widgets are the last ones in the window for the Tab key.
+        for before, after in itertools.pairwise((self._previous, *self.fields.values())):
+            QWidget.setTabOrder(before, after)
         self.updateGeometry()
 
     def set_matrix_choices(self, matrices: tuple[str, ...]) -> None:
@@ -95,6 +107,9 @@ class ArgumentForm(QWidget):
         if one.kind in ("choice", "matrix"):
             box = QComboBox()
             ignore_wheel_without_focus(box)
+            # Names of matrices are long; they must not widen the form.
+            box.setSizeAdjustPolicy(QComboBox.SizeAdjustPolicy.AdjustToMinimumContentsLengthWithIcon)
+            box.setMinimumContentsLength(_LEAST_LETTERS)
             box.addItems(
                 list(one.choices) if one.kind == "choice" else [form_text.NO_CHOICE, *self._matrices]
             )
@@ -106,6 +121,7 @@ class ArgumentForm(QWidget):
         line = QLineEdit(form_text.format_value(one.default))
         if one.default is None:
             line.setPlaceholderText("none")
+        line.setMinimumWidth(line.fontMetrics().horizontalAdvance("0" * _LEAST_LETTERS))
         line.textEdited.connect(self.edited)
         return line
 

@@ -346,7 +346,13 @@ class _ParameterGrid(PlotGrid):
         left.setWidth(self._theme.pixels(LEFT_AXIS_WIDTH))
         style_axis(self._theme, plot.getAxis("bottom"), bottom)
         plot.getAxis("bottom").setStyle(showValues=bool(bottom))
+        plot.getViewBox().sigResized.connect(lambda _, axis=left: _fit_title(axis))
         return plot
+
+
+def _fit_title(axis: pg.AxisItem) -> None:
+    """Hide the title of an axis that is longer than the axis; it would overlap the next one."""
+    axis.showLabel(axis.label.boundingRect().width() <= axis.size().height())
 
 
 class ConvergencePlot(_ParameterGrid):

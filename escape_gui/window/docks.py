@@ -57,7 +57,8 @@ class Dock(QDockWidget):
     help_requested = Signal(str)
 
     def __init__(self, panel: Panel, theme: Theme, window: QMainWindow) -> None:
-        super().__init__(panel.title, window)
+        super().__init__(panel.tab_title or panel.title, window)
+        self.toggleViewAction().setText(panel.title)
         self.setObjectName(panel.name)
         self.panel = panel
         self._theme = theme
@@ -154,8 +155,8 @@ WORKSPACES: tuple[Workspace, ...] = (
             # Form, plan and result fill a column of a small screen.
             Column((Cell(("procedure",)),), 0.95),
             # The mosaic and the detail of a mode share a column.
-            Column((Cell(("modes",)),), 1.3),
-            Column((Cell(("sprint",), 1.3), Cell(("gains", "camera", "devices", "log"), 1.0)), 1.15),
+            Column((Cell(("modes",)),), 1.25),
+            Column((Cell(("sprint",), 1.3), Cell(("gains", "camera", "devices", "log"), 1.0)), 1.2),
         ),
     ),
     Workspace(
@@ -208,8 +209,11 @@ def arrange_docks(window: QMainWindow, docks: dict[str, QDockWidget], plan: Work
         docks[name].hide()
 
 
-def hide_orphan_tab_bars(window: QMainWindow, docks: dict[str, QDockWidget]) -> None:
-    """Hide the tab bars of the previous arrangement, which Qt does not remove."""
+def arrange_tab_bars(window: QMainWindow, docks: dict[str, QDockWidget]) -> None:
+    """Hide the tab bars of the previous arrangement, which Qt does not remove; titles are not cut off.
+
+    Where there is no room for all tabs, arrows scroll them.
+    """
     groups = [
         {one.windowTitle() for one in (dock, *window.tabifiedDockWidgets(dock)) if not one.isHidden()}
         for dock in docks.values()
@@ -217,6 +221,9 @@ def hide_orphan_tab_bars(window: QMainWindow, docks: dict[str, QDockWidget]) -> 
     for bar in window.findChildren(QTabBar, options=Qt.FindChildOption.FindDirectChildrenOnly):
         if {bar.tabText(k) for k in range(bar.count())} not in groups:
             bar.hide()
+        bar.setElideMode(Qt.TextElideMode.ElideNone)
+        bar.setUsesScrollButtons(True)
+        bar.setExpanding(False)
 
 
 def _front_dock(docks: dict[str, QDockWidget], cell: Cell) -> QDockWidget:

@@ -7,6 +7,7 @@ from PySide6.QtGui import QResizeEvent
 from PySide6.QtWidgets import QFrame, QLabel, QSizePolicy, QWidget
 
 from escape_gui.theme import Theme
+from escape_gui.views.procedure_form import comparison_lines
 from escape_gui.widgets.controls import QUALITY_LEVELS, Level, StatusIndicator, caption, flat_button, row
 from escape_hw.remote.state import Finish, State
 from escape_hw.report.verdict import assess
@@ -130,6 +131,7 @@ class StateNotifier:
             level = _LEVELS[last.finish]
             if verdict is not None and last.finish is Finish.DONE:
                 level = QUALITY_LEVELS[verdict.quality]
-            parts = (last.message, "" if verdict is None else str(verdict), last.folder)
+            numbers = comparison_lines(last.document, None)
+            parts = (last.message, "" if verdict is None else str(verdict), *numbers, last.folder)
             text = "\n".join(part for part in parts if part)
             self._bar.show_message(level, f"{last.name} {last.finish.value}", text)

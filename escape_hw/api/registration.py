@@ -114,6 +114,26 @@ class Registration:
         )
         return axis_aligned, float(scaling_matrix[0, 1])
 
+    def largest_displacement(self, other: Registration, radius: float) -> float:
+        """Largest displacement of a point of the pupil from ``other`` to this registration.
+
+        Parameters
+        ----------
+        radius
+            Radius of the pupil in sub-apertures.
+
+        Returns
+        -------
+        float
+            In % of a sub-aperture.
+        """
+        matrix, offset = self.affine(1.0)
+        other_matrix, other_offset = other.affine(1.0)
+        angles = np.linspace(0, 2 * np.pi, 64, endpoint=False)
+        edge = radius * np.stack([np.cos(angles), np.sin(angles)])
+        moved = (matrix - other_matrix) @ edge + (offset - other_offset)[:, None]
+        return float(100 * np.hypot(*moved).max())
+
     def affine(self, sub_aperture_m: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Matrix ``(2, 2)`` and offset ``(2,)`` in metres of the actuator positions.
 

@@ -17,6 +17,10 @@ _LOOP_COLUMNS = (
 )  # fmt: skip
 COLUMNS = ("seconds", *PARAMETERS, *(f"{name}_sigma" for name in PARAMETERS), *_LOOP_COLUMNS)
 
+#: Progress metric of the tracker: largest displacement of a point of the mirror on the sensor since the start
+#: of tracking, in % of a sub-aperture.
+DRIFT = "drift"
+
 
 @dataclass(frozen=True, slots=True)
 class Alarm:

@@ -14,6 +14,11 @@ from rich.text import Text
 from escape_hw.api.influence import InfluenceProfile
 from escape_hw.api.results import CalibrationResult
 from escape_hw.report.tables import Table
+from escape_hw.report.verdict import Quality, assess
+
+_QUALITY_STYLES = {
+    Quality.GOOD: "bold green", Quality.USABLE: "bold yellow", Quality.NOT_USABLE: "bold red",
+}  # fmt: skip
 
 
 def status_line(simulated: bool, partial: bool) -> Text:
@@ -45,9 +50,10 @@ def format_calibration(result: CalibrationResult) -> list[str]:
     """A calibration in a few lines."""
     matrix = result.matrix
     snr = (result.measured or matrix).snr()
+    seconds = f"{result.sky_seconds:.3g} s{', simulated' if matrix.simulated else ''}"
     lines = [
         f"{matrix.method}: {matrix.n_modes} modes, {result.grid.n_valid} {result.grid.elements}, "
-        f"{result.frames} frames ({result.sky_seconds:.3g} s), {result.lost_frames} lost",
+        f"{result.frames} frames ({seconds}), {result.lost_frames} lost",
         f"signal-to-noise ratio per mode: minimum {snr.min():.3g}, median {sorted(snr)[len(snr) // 2]:.3g}",
     ]
     if result.response is not None:
@@ -61,6 +67,12 @@ def format_criteria(checks: Iterable[Mapping[str, Any]]) -> list[Text]:
         Text(f"{'✓' if entry['met'] else '✗'} {entry['text']}", style="green" if entry["met"] else "bold red")
         for entry in checks
     ]
+
+
+def format_verdict(document: Mapping[str, Any]) -> list[Text]:
+    """The line of verdict on a result; none on a result without a criterion."""
+    verdict = assess(document)
+    return [] if verdict is None else [Text(str(verdict), style=_QUALITY_STYLES[verdict.quality])]
 
 
 def format_products(products: Mapping[str, Any]) -> list[str]:

@@ -20,6 +20,7 @@ from escape_hw.report.figures import registration as figures_registration
 from escape_hw.report.figures import style
 from escape_hw.report.figures import track as figures_track
 from escape_hw.report.sweep import sweep_section
+from escape_hw.report.verdict import assess
 
 REPORT = "report.html"
 
@@ -64,6 +65,7 @@ def render_page(run: RunContent) -> str:
     parts = [
         f"<h1>{html.escape(title)}</h1>",
         f'<p class="lead">{html.escape(lead)}</p>',
+        _verdict_line(run),
         html.key_values(_key_numbers(run)),
         html.section("Criteria", html.criteria_list(document.get("criteria") or [])),
         _registration_section(run),
@@ -77,6 +79,14 @@ def render_page(run: RunContent) -> str:
         _origin_section(run),
     ]
     return html.page(title, banners, [part for part in parts if part])
+
+
+def _verdict_line(run: RunContent) -> str:
+    verdict = assess(run.document)
+    if verdict is None:
+        return ""
+    kind = verdict.quality.name.lower().replace("_", "-")
+    return f'<p class="verdict {kind}" role="status">{html.escape(str(verdict))}</p>'
 
 
 def _key_numbers(run: RunContent) -> dict[str, str]:

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Any
+from typing import Any, TypeGuard
 
 #: Signal-to-noise ratio of the worst mode from which a measured matrix is good, and usable.
 GOOD_SNR, USABLE_SNR = 3.0, 1.0
@@ -33,6 +33,10 @@ class Verdict:
     reason: str
     advice: str = ""
 
+    def to_dict(self) -> dict[str, str]:
+        """Plain values for JSON."""
+        return {"quality": self.quality.text, "reason": self.reason, "advice": self.advice}
+
     def __str__(self) -> str:
         line = (
             f"{self.quality.text.capitalize()}: {self.reason}"
@@ -51,31 +55,49 @@ def assess(document: Mapping[str, Any]) -> Verdict | None:
     return Verdict(Quality.GOOD, ", ".join(figures)) if figures else None
 
 
+def verdict_document(document: Mapping[str, Any]) -> dict[str, str] | None:
+    """The verdict in plain values, for JSON."""
+    verdict = assess(document)
+    return None if verdict is None else verdict.to_dict()
+
+
 def _problems(document: Mapping[str, Any]) -> Iterator[Verdict]:
-    for criterion in document.get("criteria") or ():
-        if not criterion.get("met", True):
-            yield Verdict(Quality.NOT_USABLE, f"not met: {criterion.get('text')}", "see the report")
+    alarms = _mappings(document.get("alarms"))
+    if document.get("stable") is False:
+        yield Verdict(
+            Quality.NOT_USABLE,
+            "the loop was not stable",
+            "lower the gain, drop more modes, or calibrate again",
+        )
     if document.get("converged") is False:
         yield Verdict(Quality.NOT_USABLE, "not converged", "read the warnings, and measure more frames")
+    for criterion in _mappings(document.get("criteria")):
+        text = str(criterion.get("text"))
+        # Alarms are judged below.
+        if not criterion.get("met", True) and not (alarms and text.startswith("no alarms")):
+            yield Verdict(Quality.NOT_USABLE, f"not met: {text}", "see the report")
     yield from _noisy_modes(document)
     if document.get("partial"):
-        yield Verdict(
-            Quality.USABLE, "the run was aborted, the data measured so far are saved", "run it again"
-        )
-    for warning in document.get("warnings") or ():
+        after = f" after {frames:,} frames" if _is_number(frames := document.get("frames")) else ""
+        yield Verdict(Quality.USABLE, f"the run was aborted{after}", "run it again")
+    warnings = document.get("warnings")
+    for warning in warnings if isinstance(warnings, list | tuple) else ():
         yield Verdict(Quality.USABLE, str(warning), "see the report")
-    if alarms := document.get("alarms"):
-        yield Verdict(Quality.USABLE, f"{len(alarms)} alarms", "see the report")
+    if alarms:
+        many = f"{len(alarms)} alarms, the last" if len(alarms) > 1 else "an alarm"
+        yield Verdict(Quality.USABLE, f"{many}: {alarms[-1].get('text', '')}", "see the report")
 
 
 def _noisy_modes(document: Mapping[str, Any]) -> Iterator[Verdict]:
     """Modes with too much noise; those of a fitted model do not enter its matrix."""
-    worst = (document.get("snr") or {}).get("min")
-    if not isinstance(worst, int | float) or not math.isfinite(worst) or worst >= GOOD_SNR:
+    worst = _mapping(document.get("snr")).get("min")
+    if not _is_number(worst) or worst >= GOOD_SNR:
         return
     is_fitted = document.get("converged") is not None
     quality = Quality.USABLE if worst >= USABLE_SNR or is_fitted else Quality.NOT_USABLE
     frames = document.get("frames")
+    if not _is_number(frames):
+        frames = 0
     # The signal-to-noise ratio grows with the square root of the number of frames; two digits are enough.
     more = "measure more frames"
     if frames:
@@ -85,11 +107,43 @@ def _noisy_modes(document: Mapping[str, Any]) -> Iterator[Verdict]:
 
 def _figures(document: Mapping[str, Any]) -> Iterator[str]:
     """The numbers that make a result good."""
-    worst = (document.get("snr") or {}).get("min")
-    if isinstance(worst, int | float):
+    worst = _mapping(document.get("snr")).get("min")
+    if _is_number(worst):
         yield f"SNR {worst:.3g} in the worst mode"
     if document.get("converged"):
-        iterations = document.get("iterations")
-        yield f"converged in {iterations} iterations" if iterations else "converged"
+        # Rounds of a measurement of optical gains, iterations of SPRINT.
+        number, what = document.get("iterations"), "iterations"
+        if number is None and (rounds := _mappings(document.get("rounds"))):
+            number, what = len(rounds), "rounds"
+        yield f"converged in {number} {what}" if number else "converged"
     if document.get("stable"):
         yield "loop stable"
+        if _is_number(residual := document.get("residual_rms_nm")):
+            yield f"residual {residual:.0f} nm rms"
+        if (strehl := strehl_ratio(document)) is not None:
+            yield f"Strehl ratio {100 * strehl:.1f} %"
+    criteria = _mappings(document.get("criteria"))
+    if criteria and not any(key in document for key in ("snr", "converged", "stable")):
+        yield f"all {len(criteria)} criteria met" if len(criteria) > 1 else f"met: {criteria[0].get('text')}"
+
+
+def strehl_ratio(document: Mapping[str, Any]) -> float | None:
+    """The Strehl ratio (peak) of a closed loop or of a track; ``None`` if it was not measured."""
+    strehl = document.get("strehl")
+    if isinstance(strehl, Mapping):
+        strehl = _mapping(strehl.get("peak")).get("value")
+    return float(strehl) if _is_number(strehl) else None
+
+
+def _mapping(value: object) -> Mapping[str, Any]:
+    """A mapping of a document, empty if the file has something else there."""
+    return value if isinstance(value, Mapping) else {}
+
+
+def _mappings(value: object) -> list[Mapping[str, Any]]:
+    """The mappings of a list of a document."""
+    return [one for one in value if isinstance(one, Mapping)] if isinstance(value, list | tuple) else []
+
+
+def _is_number(value: object) -> TypeGuard[float]:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)

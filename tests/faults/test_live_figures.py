@@ -7,6 +7,7 @@ import pytest
 from small_bench import small
 
 from escape_hw.api.registration import TO_STREAM_UNITS
+from escape_hw.api.tracking import DRIFT
 from escape_hw.calibration.acquisition import preview
 from escape_hw.calibration.acquisition.preview import MatrixPreview
 from escape_hw.calibration.docrime.closed_loop import docrime_closed_loop
@@ -34,6 +35,7 @@ def watched(bench, procedure):
     shown = {}
 
     def watch(progress):
+        shown.setdefault("metrics", []).append(progress.metrics)
         for name, array in progress.arrays.items():
             assert array.dtype == np.float32, name
             shown.setdefault(name, []).append(array.copy())
@@ -127,6 +129,9 @@ def test_tracking_shows_its_course():
     np.testing.assert_allclose(course[:, 1], result.column("shift_x")[:rows] / 100, rtol=1e-5)
     np.testing.assert_allclose(course[:, 8], np.deg2rad(result.column("rotation_sigma")[:rows]), rtol=1e-5)
     assert shown["gains"][-1].shape == (start.matrix.n_modes,)
+    drift = shown["metrics"][-1][DRIFT]
+    moved = np.hypot(*(course[-1, k] - course[0, k] for k in (1, 2)))
+    assert 0 <= drift < 20 + 100 * moved
 
 
 def test_pictures_take_a_small_share_of_the_time(monkeypatch):

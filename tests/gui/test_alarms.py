@@ -12,7 +12,7 @@ from scripted import ScriptedSource
 
 from escape_gui.main_window import MainWindow
 from escape_gui.panels.log import LogPanel
-from escape_hw.remote.state import FrameCounters, Illumination
+from escape_hw.remote.state import ActiveRun, FrameCounters, Illumination
 
 
 @pytest.fixture
@@ -64,6 +64,12 @@ def test_without_limits_there_is_no_alarm(window: MainWindow, source: ScriptedSo
             "Lost frames 120 frames, above 100 frames",
         ),
         ("saturated", "2", {"illumination": Illumination(saturated=0.05)}, "Saturated pixels 5 %, above 2 %"),
+        (
+            "drift",
+            "25",
+            {"active_run": ActiveRun(id=4, name="track", arguments={}, metrics={"drift": 31.4})},
+            "Registration drift 31.4 % of a sub-aperture, above 25 %",
+        ),
     ],
 )
 def test_an_alarm_is_raised_heard_and_acknowledged(

@@ -190,10 +190,37 @@ def test_pages_change(calibrate, source):
     assert (page, pages > 1) == (0, True)
     press(panel._next_button)
     assert panel.mosaic.page[0] == 1
-    assert panel._page_label.text() == f"page 2 of {pages}"
+    assert panel._page_label.text() == f"2 of {pages}"
     panel.mosaic.choose(29)
     assert panel.mosaic.page[0] == pages - 1
     assert not panel._next_button.isEnabled()
+
+
+# ---------------------------------------------------------------- keyboard
+def test_the_tab_key_goes_through_the_form_before_the_buttons(
+    calibrate: MainWindow, control: ScriptedControl
+) -> None:
+    panel = calibrate.panels["procedure"]
+    until(panel.start.isEnabled, calibrate)
+    panel.choice.setCurrentIndex(1)
+    panel.choice.setCurrentIndex(0)
+    until(panel.start.isEnabled, calibrate)
+    calibrate.activateWindow()
+    panel.choice.setFocus()
+    reached = []
+    for _ in range(7):
+        QTest.keyClick(QApplication.focusWidget(), Qt.Key.Key_Tab)
+        widget = QApplication.focusWidget()
+        text = widget.text() if isinstance(widget, QPushButton) else ""
+        reached.append(widget.accessibleName() or text.replace("&", ""))
+    assert reached == ["Frames", "Snr", "Pokes", "Plain", "Closed loop", "Check", "Start"]
+
+
+def test_another_workspace_leaves_the_focus_to_nobody(calibrate: MainWindow) -> None:
+    calibrate.activateWindow()
+    calibrate.panels["procedure"].choice.setFocus()
+    calibrate.show_workspace("operate")
+    assert QApplication.focusWidget() is calibrate
 
 
 # ---------------------------------------------------------------- SPRINT and gains

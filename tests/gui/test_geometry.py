@@ -1,20 +1,37 @@
-"""The safety buttons and the last line are visible at any width from 1024 pixels."""
+"""The window from 1024 pixels: safety buttons, last line, titles and newest values are visible."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
+import fake_results as fake
+import numpy as np
 import pytest
 from gui_windows import dispose, show_window
-from PySide6.QtCore import QPoint, QRect
-from PySide6.QtWidgets import QApplication, QWidget
+from PySide6.QtCore import QPoint, QRect, Qt
+from PySide6.QtWidgets import QApplication, QScrollArea, QTabBar, QWidget
+from scripted import ScriptedSource
 
 from escape_gui.client.session import Session
 from escape_gui.main_window import MainWindow
 from escape_gui.settings import Settings
 from escape_gui.window.docks import WORKSPACES
+from escape_hw.api.registration import TO_STREAM_UNITS
+from escape_hw.io.documents import calibration_document
+from escape_hw.remote.state import Finish, FinishedRun, ProcedureEntry, ProcedureParameter
 
 Show = Callable[[Settings], MainWindow]
+RESULT = fake.calibration("escape", n=8, n_modes=6)
+MATRIX = fake.matrix("docrime-whitened", n=24, n_modes=30)
+ESCAPE = ProcedureEntry(
+    name="escape", title="ESCAPE", help="Measure, fit, compute.",
+    parameters=(
+        ProcedureParameter(name="accuracy", kind="float", unit="% of a sub-aperture", label="Accuracy goal"),
+        ProcedureParameter(name="pokes", kind="choice", default="white", choices=("white", "anticorrelated")),
+        ProcedureParameter(name="whiten", kind="bool", default=True, label="Whiten turbulence"),
+        ProcedureParameter(name="closed_loop", kind="matrix"),
+    ),
+)  # fmt: skip
 
 
 @pytest.fixture
@@ -68,3 +85,41 @@ def test_the_layout_of_a_wide_screen_fits_a_narrow_one(show: Show) -> None:
     QApplication.processEvents()
     assert QRect(0, 0, 1024, 768).contains(window.geometry())
     check(window, 1016, 736)
+
+
+def wide_panels(window: MainWindow) -> set[str]:
+    """Visible panels that do not fit the width of their dock."""
+    areas = {name: dock.widget() for name, dock in window.docks.items() if not dock.visibleRegion().isEmpty()}
+    return {
+        name
+        for name, area in areas.items()
+        if isinstance(area, QScrollArea) and area.horizontalScrollBar().maximum() > 0
+    }
+
+
+@pytest.mark.parametrize("workspace", [one.name for one in WORKSPACES])
+def test_panels_and_their_tabs_fit_the_narrowest_window(
+    workspace: str, show: Show, source: ScriptedSource
+) -> None:
+    source.entries = (ESCAPE,)
+    window = show(Settings(workspace=workspace))
+    window.resize(1024, 700)
+    # With a registration, and without a Strehl ratio.
+    path = np.array([step.registration.to_array() for step in fake.registration().iterations])
+    source.push("valid", MATRIX.valid.astype(np.float32))
+    source.push("matrix", MATRIX.data, method="docrime")
+    source.push("registration", (path * TO_STREAM_UNITS).astype(np.float32))
+    ended = FinishedRun(id=3, name="escape", finish=Finish.DONE, document=calibration_document(RESULT))
+    loop = source.state.loop.model_copy(update={"strehl": None})
+    source.change(last_run=ended, loop=loop)
+    for _ in range(5):
+        window.update_timer.tick(force=True)
+        QApplication.processEvents()
+    assert wide_panels(window) == set()
+    form = window.panels["procedure"].form
+    assert form._area.horizontalScrollBar().maximum() == 0
+    for bar in window.findChildren(QTabBar, options=Qt.FindChildOption.FindDirectChildrenOnly):
+        if bar.isVisible() and bar.count():
+            assert bar.elideMode() is Qt.TextElideMode.ElideNone
+            last = bar.tabRect(bar.count() - 1)
+            assert bar.rect().contains(last), [bar.tabText(k) for k in range(bar.count())]

@@ -11,8 +11,11 @@ import pytest
 from pytestqt.qtbot import QtBot
 from scripted import ScriptedSource, running
 
+from escape_gui.app import WindowController
 from escape_gui.client import connection as live
 from escape_gui.client.connection import LiveSource, ServerAttachment
+from escape_gui.client.session import Session
+from escape_gui.main_window import MainWindow
 from escape_hw.errors import ServerGone
 from escape_hw.remote.source import Sample
 from escape_hw.remote.state import Geometry, ProcedureEntry
@@ -142,3 +145,17 @@ def test_close_closes_the_connection(network: Network, found: list[LiveSource], 
         assert found[0].state.serial == 5
         assert attachment.address == "razor-shwfs"
     assert network.made[0].closed
+
+
+def test_the_message_without_a_server_is_closed_when_one_answers(
+    small_window: MainWindow, session: Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ServerAttachment, "start", lambda self: None)
+    controller = WindowController(small_window, session, "razor-shwfs", None)
+    controller.attachment.connection_failed.emit("no server of 'razor-shwfs' runs here")
+    titles = [one.title for one in small_window.notifications.notifications]
+    assert titles == ["No server"]
+    controller.attachment.attached.emit(LiveSource(FakeConnection(), is_local=True))
+    assert small_window.notifications.notifications == []
+    controller.close()
+    controller.deleteLater()

@@ -268,6 +268,12 @@ def test_devices_are_listed_with_units(window: MainWindow, source: ScriptedSourc
 )
 def test_format_of_facts(key: str, value: float | str, text: str) -> None:
     assert format_fact(key, value) == text
+    assert format_fact(key, value, simulated=True) == text
+
+
+def test_the_frame_rate_of_a_twin_is_marked() -> None:
+    assert format_fact("frame_rate_hz", 500.0) == "frame rate 500.0 Hz"
+    assert format_fact("frame_rate_hz", 500.0, simulated=True) == "simulated frame rate 500.0 Hz"
 
 
 def test_a_full_disk_is_notified(window: MainWindow, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -293,5 +299,5 @@ def test_a_missing_reference_psf_is_shown(make_window: MakeWindow, source: Scrip
     source.streams["model_psf"] = model
     source.change(streams=(StreamEntry(name="model_psf", segment="", unit=""),))
     window.update_timer.tick(force=True)
-    assert psf.captions["model_psf"].text() == "PSF: reference (dashed)"
+    assert psf.captions["model_psf"].text() == "PSF: reference (- -)"
     assert not performance.reference_missing_label.isVisible()

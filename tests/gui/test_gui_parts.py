@@ -114,7 +114,7 @@ def test_sound_settings_survive_beside_damaged_ones(tmp_path: Path) -> None:
 
 
 def test_a_missing_settings_file_gives_no_warning(tmp_path: Path) -> None:
-    assert load_settings(tmp_path / "none.json") == (Settings(), ())
+    assert load_settings(tmp_path / "none.json") == (Settings(workspace="align"), ())
 
 
 # ---------------------------------------------------------------- requests
@@ -268,7 +268,7 @@ def test_without_a_display_the_message_names_the_remedy(
     for name in ("QT_QPA_PLATFORM", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("DISPLAY", display)
-    monkeypatch.setattr("ctypes.util.find_library", lambda name: None)
+    monkeypatch.setattr("escape_hw.runtime.host.doctor._can_load", lambda name: False)
     with pytest.raises(ConfigError, match=said):
         require_display()
     monkeypatch.setenv("QT_QPA_PLATFORM", "offscreen")

@@ -108,23 +108,30 @@ class Operator:
 
 
 @contextmanager
+def operator_window(system: str, **settings: str) -> Iterator[Operator]:
+    """A window as created by the command, connected to the server of a system on this computer."""
+    session = Session()
+    window = MainWindow(session, Settings(**{"workspace": "calibrate", **settings}), None)
+    controller = WindowController(window, session, system, None)
+    window.resize(1280, 800)
+    window.update_timer.start()
+    window.show()
+    try:
+        yield Operator(window)
+    finally:
+        dispose(window)
+        session.close()
+        session.deleteLater()
+        controller.close()
+        controller.deleteLater()
+
+
+@contextmanager
 def operating(system: str | Path, folder: Path, **settings: str) -> Iterator[Operator]:
-    """A server of a system, and a window as created by the command."""
+    """A server of a system, and a window on it."""
     # Long time limits: on a busy computer frames are late.
     patient = ("--set", "server.engine_silence_s=120", "--set", "server.no_frames_s=60")
     with serving.serving(system, "--quiet", *patient, folder=folder) as served:
         os.environ["XDG_RUNTIME_DIR"] = served.environment["XDG_RUNTIME_DIR"]
-        session = Session()
-        window = MainWindow(session, Settings(**{"workspace": "calibrate", **settings}), None)
-        controller = WindowController(window, session, serving.SYSTEM, None)
-        window.resize(1280, 800)
-        window.update_timer.start()
-        window.show()
-        try:
-            yield Operator(window)
-        finally:
-            dispose(window)
-            session.close()
-            session.deleteLater()
-            controller.close()
-            controller.deleteLater()
+        with operator_window(serving.SYSTEM, **settings) as operator:
+            yield operator

@@ -13,6 +13,7 @@ from escape_hw.io.fits.matrix import save_matrix
 
 def test_show_and_compare(escape, document, im, tmp_path):
     assert "SHA-256" in escape("show", im)[1]
+    assert "SNR" in escape("show", im)[1]
     code, found, _ = document("show", im)
     assert (code, found["header"]["KIND"], found["metrics"]["poke"]) == (0, "IM", 0.02)
     psf = save_loop(tmp_path / "psf.fits", fake.loop(), "razor-shwfs", True, fake.ORIGIN)
@@ -42,7 +43,11 @@ def test_report_is_built_again_after_the_folder_has_moved(escape, document, tmp_
     assert (code, found["report"]) == (0, str(moved / "report.html"))
     # The run's log, shown in the report, has grown since; the figures are the same to the byte.
     assert (moved / "report.html").read_text().split("<h2>Origin")[0] == before.split("<h2>Origin")[0]
-    assert document("show", moved)[1]["command"] == "calibrate"
+    again = document("show", moved)[1]
+    assert again["command"] == "calibrate"
+    verdict = again["verdict"]
+    assert verdict["quality"] in ("good", "usable", "not usable")
+    assert f"{verdict['quality'].capitalize()}: {verdict['reason']}" in escape("show", moved)[1]
     # A calibration alone has no image to draw.
     code, _, err = escape("report", moved, "--picture", tmp_path / "picture.png")
     assert code == 2

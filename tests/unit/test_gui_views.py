@@ -12,7 +12,14 @@ from escape_gui.views.convergence import ConvergenceHistory, RegistrationDrift
 from escape_gui.views.gain_curves import GainCurve, axis_sides, live_curve
 from escape_gui.views.mode_maps import ModeStatistics, MosaicLayout, tiles
 from escape_hw.api.registration import TO_STREAM_UNITS
-from escape_hw.remote.state import ActiveRun, Finish, FinishedRun, ProcedureParameter, ProductEntry
+from escape_hw.remote.state import (
+    ActiveRun,
+    Finish,
+    FinishedRun,
+    ProcedureParameter,
+    ProcedurePlan,
+    ProductEntry,
+)
 
 
 # ---------------------------------------------------------------- mosaic
@@ -208,6 +215,32 @@ def test_a_result_is_compared_with_the_one_before():
     assert lines[1] == "Gain of the matrix: 1.02 (before: 1)"
     assert lines[2] == "SNR of the worst mode: 9 (before: 7)"
     assert form.comparison_lines({}, None) == []
+
+
+def test_results_of_every_procedure_are_stated_in_numbers():
+    loop = {
+        "gain": 0.4, "residual_rms_nm": 44.2, "strehl": {"peak": {"value": 0.365, "sigma": 0.004}},
+        "frames": 2000, "rate_hz": 500.0, "lost_frames": 3, "simulated": True,
+    }  # fmt: skip
+    assert form.comparison_lines(loop, {**loop, "strehl": 0.3}) == [
+        "Gain of the loop: 0.4 (before: 0.4)",
+        "Residual: 44.2 nm rms (before: 44.2 nm rms)",
+        "Strehl ratio: 36.5 % (before: 30.0 %)",
+        "Frames: 2,000, 4.0 s (simulated), 3 lost",
+    ]
+    gains = {"optical_gain": [0.5, 0.7], "exchanges": [{"accepted": True}, {}], "alarms": [{}]}
+    assert form.comparison_lines(gains, None) == [
+        "Optical gain: mean 0.600, 0.500 to 0.700", "Matrix exchanged: 1 of 2 proposals", "Alarms: 1",
+    ]  # fmt: skip
+    sensor = {"n_sub_apertures": 448, "counts": 3426.0, "background": 1.1}
+    assert form.comparison_lines(sensor, None)[0] == "Sub-apertures: 448"
+
+
+def test_rates_of_a_twin_are_marked():
+    plan = ProcedurePlan(name="docrime", arguments={}, frames=1000, seconds=2.0, stroke=0.02)
+    assert form.plan_lines(plan)[0] == "1000 frames, 2.0 s at the camera's frame rate"
+    simulated = form.plan_lines(plan, simulated=True)
+    assert simulated[0] == "1000 frames, 2.0 s at the simulated frame rate of the camera"
 
 
 def test_the_newest_matrix_is_offered_first():

@@ -60,6 +60,24 @@ def test_five_numbers_are_needed(size: int) -> None:
         Registration.from_array(np.zeros(size))
 
 
+@pytest.mark.parametrize(
+    ("changes", "displacement"),
+    [
+        ({}, 0.0),
+        ({"shift_x": 3.0, "shift_y": -4.0}, 5.0),
+        # A degree at ten sub-apertures from the centre; a per cent there.
+        ({"rotation": 1.0}, 2 * 1000 * np.sin(np.deg2rad(0.5))),
+        ({"radial_scaling": 1.0}, 10.0),
+    ],
+)
+def test_displacement_is_that_of_the_edge_of_the_pupil(
+    changes: dict[str, float], displacement: float
+) -> None:
+    start = Registration()
+    found = Registration(**changes).largest_displacement(start, radius=10.0)
+    assert found == pytest.approx(displacement, rel=1e-9)
+
+
 def test_the_anamorphosis_angle_turns_the_scalings_from_y_towards_x() -> None:
     both = {"radial_scaling": 10.0, "tangential_scaling": -10.0, "anamorphosis_angle": 45.0}
     np.testing.assert_allclose(placed(EAST - SOUTH, **both), 1.1 * (EAST - SOUTH))

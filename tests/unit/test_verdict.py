@@ -23,8 +23,24 @@ ESCAPE = {"converged": True, "iterations": 15, "frames": 600, "snr": {"min": 23.
         ({"converged": None, "snr": {"min": 2.0}}, Quality.USABLE, "measure about 1,400 frames"),
         ({"criteria": [{"text": "loop stable", "met": False}]}, Quality.NOT_USABLE, "not met: loop stable"),
         ({"warnings": ["scaling beyond 5 %"]}, Quality.USABLE, "scaling beyond 5 %; see the report"),
-        ({"partial": True}, Quality.USABLE, "aborted"),
-        ({"alarms": [{}, {}]}, Quality.USABLE, "2 alarms"),
+        ({"partial": True}, Quality.USABLE, "Usable: the run was aborted after 600 frames; run it again"),
+        ({"alarms": [{}, {"text": "jumped"}]}, Quality.USABLE, "2 alarms, the last: jumped; see the report"),
+        ({"stable": False}, Quality.NOT_USABLE, "the loop was not stable; lower the gain"),
+        (
+            {"alarms": [{"text": "x"}], "criteria": [{"text": "no alarms (1)", "met": False}]},
+            Quality.USABLE,
+            "an alarm: x",
+        ),
+        (
+            {"converged": None, "snr": None, "stable": True, "residual_rms_nm": 44.1, "strehl": 0.365},
+            Quality.GOOD,
+            "Good: loop stable, residual 44 nm rms, Strehl ratio 36.5 %",
+        ),
+        (
+            {"iterations": None, "rounds": [{}, {}], "snr": None},
+            Quality.GOOD,
+            "Good: converged in 2 rounds",
+        ),
     ],
 )
 def test_verdict_has_quality_reason_and_advice(
@@ -34,6 +50,22 @@ def test_verdict_has_quality_reason_and_advice(
     assert verdict is not None
     assert verdict.quality is quality
     assert words in str(verdict)
+
+
+def test_criteria_alone_make_a_verdict() -> None:
+    criteria = [{"text": "loop stable", "met": True}, {"text": "Strehl compared", "met": True}]
+    assert str(assess({"criteria": criteria})) == "Good: all 2 criteria met"
+    assert str(assess({"criteria": criteria[:1]})) == "Good: met: loop stable"
+
+
+@pytest.mark.parametrize(
+    "document",
+    [{"snr": "high"}, {"snr": {"min": "1"}}, {"criteria": [3]}, {"alarms": ["x"]}, {"warnings": 4},
+     {"strehl": {"peak": 3}, "stable": True}, {"snr": {"min": 2.0}, "frames": "many"}],
+)  # fmt: skip
+def test_a_damaged_document_is_assessed_as_far_as_it_goes(document: dict[str, object]) -> None:
+    verdict = assess(document)
+    assert verdict is None or str(verdict)
 
 
 def test_a_result_without_a_criterion_has_no_verdict() -> None:

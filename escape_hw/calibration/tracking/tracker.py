@@ -15,7 +15,7 @@ from escape_hw.api.procedure import Procedure, Progress, Reporter
 from escape_hw.api.registration import PARAMETERS, TO_STREAM_UNITS
 from escape_hw.api.results import CalibrationResult, Estimate, RegistrationEstimate, TemporalResponse
 from escape_hw.api.sensor import SensorGeometry
-from escape_hw.api.tracking import Alarm, TrackResult
+from escape_hw.api.tracking import DRIFT, Alarm, TrackResult
 from escape_hw.bench import Bench
 from escape_hw.calibration.acquisition.aligned_telemetry import AlignedTelemetry, TelemetryBuffer
 from escape_hw.calibration.acquisition.pokes import RandomPokes, compute_poke_amplitudes
@@ -152,6 +152,7 @@ class _Tracker:
         self.response, self.memory = response, forgetting_time_s / STEP_S
         self.dropped = bench.config.loop.dropped_modes
         self.in_use = ActiveReconstructor(matrix, invert_matrix(matrix, self.dropped), start, 1.0)
+        self.start = start.registration
         self.alarm_monitor = AlarmMonitor(start.registration, t.max_shift, response)
         self.result = TrackResult(poke=poke)
         self.frames = max(1, round(STEP_S * bench.wfs.settings.frame_rate_hz))
@@ -308,7 +309,10 @@ class _Tracker:
         self.residual_at = len(loop.record.residual)
         row = build_row(update, relative, relative_sigma, residual, exchanged)
         result.add(**row)
-        self.metrics = {name: row[name] for name in PROGRESS_COLUMNS}
+        # Of an actuator at the edge of the pupil, since the start.
+        radius = math.sqrt(self.grid.n_valid / math.pi)
+        drift = live.registration.registration.largest_displacement(self.start, radius)
+        self.metrics = {**{name: row[name] for name in PROGRESS_COLUMNS}, DRIFT: drift}
         self.arrays = progress_arrays(result)
 
 

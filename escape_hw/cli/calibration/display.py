@@ -18,16 +18,17 @@ if TYPE_CHECKING:
 def format_result(
     procedure: str, result: object, simulated: bool, document: dict[str, Any]
 ) -> Iterator[RenderableType]:
-    """Format the result of a procedure: its origin, its values, criteria and products.
+    """Format the result of a procedure: its origin, its values, criteria, verdict and products.
 
     A procedure without a table of its own has criteria and products only.
     """
-    from escape_hw.cli.formatting import format_criteria, format_products, status_line
+    from escape_hw.cli.formatting import format_criteria, format_products, format_verdict, status_line
 
     yield status_line(simulated, bool(document.get("partial")))
     if procedure in _VALUES:
         yield from _VALUES[procedure](result, document)
     yield from format_criteria(document.get("criteria", ()))
+    yield from format_verdict(document)
     yield from format_products(document["products"])
 
 

@@ -270,6 +270,7 @@ def _show_registration(context: CommandContext, columns: dict[str, Any], documen
 
 
 def _show_criteria(context: CommandContext, document: dict[str, Any]) -> None:
-    from escape_hw.cli.formatting import format_criteria
+    from escape_hw.cli.formatting import format_criteria, format_verdict
 
-    context.show(*format_criteria(document["criteria"]), f"report: {document['products']['report']}")
+    context.show(*format_criteria(document["criteria"]), *format_verdict(document))
+    context.show(f"report: {document['products']['report']}")

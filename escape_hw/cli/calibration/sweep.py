@@ -229,7 +229,13 @@ def _save(
 
 
 def _show(context: CommandContext, document: Mapping[str, Any]) -> None:
-    from escape_hw.cli.formatting import format_criteria, format_products, rich_table, status_line
+    from escape_hw.cli.formatting import (
+        format_criteria,
+        format_products,
+        format_verdict,
+        rich_table,
+        status_line,
+    )
     from escape_hw.report.sweep import best_table, importance_table
 
     context.result(document, met=all(entry["met"] for entry in document["criteria"]))
@@ -239,4 +245,5 @@ def _show(context: CommandContext, document: Mapping[str, Any]) -> None:
     if document["sweep"]["importance"]:
         context.show(rich_table(importance_table(document)))
     context.show(*(row["text"] for row in document["comparisons"]))
-    context.show(*format_criteria(document["criteria"]), *format_products(document["products"]))
+    context.show(*format_criteria(document["criteria"]), *format_verdict(document))
+    context.show(*format_products(document["products"]))

@@ -28,7 +28,7 @@ def show(
 
 
 def _show_product(context: CommandContext, file: Path) -> None:
-    from escape_hw.cli.formatting import rich_table, status_line
+    from escape_hw.cli.formatting import format_verdict, rich_table, status_line
     from escape_hw.cli.products.summaries import summarise_product
     from escape_hw.io.fits import file as fits_file
     from escape_hw.report.tables import Table
@@ -39,15 +39,23 @@ def _show_product(context: CommandContext, file: Path) -> None:
     simulated, partial = bool(header["SIMULATE"]), header["FINISH"] == "aborted"
     cards = tuple((key, str(value)) for key, value in header.items())
     context.show(f"{file}: kind {header['KIND']}", status_line(simulated, partial), *lines)
+    context.show(*format_verdict(document))
     context.show(rich_table(Table(("Card", "value"), cards, numeric=False)), f"SHA-256: {sha256}")
     context.set_subject(header["SYSTEM"], simulated, header.get("SEED"))
     context.report(**document, file=file.absolute(), header=header, sha256=sha256)
 
 
 def _show_run(context: CommandContext, folder: Path) -> None:
-    from escape_hw.cli.formatting import format_criteria, format_products, rich_table, status_line
+    from escape_hw.cli.formatting import (
+        format_criteria,
+        format_products,
+        format_verdict,
+        rich_table,
+        status_line,
+    )
     from escape_hw.report.content import read_run
     from escape_hw.report.tables import registration_table, rounds_table, strehl_table
+    from escape_hw.report.verdict import verdict_document
 
     run = read_run(folder)
     document = run.document
@@ -58,8 +66,9 @@ def _show_run(context: CommandContext, folder: Path) -> None:
         context.show(rich_table(rounds_table(gains)))
     if run.loops:
         context.show(rich_table(strehl_table(run.loops)))
-    context.show(*format_criteria(document.get("criteria", [])), *format_products(document["products"]))
-    context.result({**document, "folder": run.folder})
+    context.show(*format_criteria(document.get("criteria", [])), *format_verdict(document))
+    context.show(*format_products(document["products"]))
+    context.result({**document, "folder": run.folder, "verdict": verdict_document(document)})
 
 
 @command("compare")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import ctypes.util
+import ctypes
 import importlib.metadata
 import importlib.util
 import os
@@ -115,15 +115,24 @@ def _check_packages() -> Iterator[Finding]:
 
 #: Libraries that Qt needs for a display (X11), and their packages of Debian and Ubuntu.
 QT_LIBRARIES = {
-    "xcb-cursor": "libxcb-cursor0", "xcb-icccm": "libxcb-icccm4", "xcb-image": "libxcb-image0",
-    "xcb-keysyms": "libxcb-keysyms1", "xcb-render-util": "libxcb-render-util0",
-    "xkbcommon-x11": "libxkbcommon-x11-0",
+    "libxcb-cursor.so.0": "libxcb-cursor0", "libxcb-icccm.so.4": "libxcb-icccm4",
+    "libxcb-image.so.0": "libxcb-image0", "libxcb-keysyms.so.1": "libxcb-keysyms1",
+    "libxcb-render-util.so.0": "libxcb-render-util0", "libxkbcommon-x11.so.0": "libxkbcommon-x11-0",
 }  # fmt: skip
 
 
 def missing_qt_libraries() -> tuple[str, ...]:
     """Packages of the libraries that Qt does not find on this computer."""
-    return tuple(package for name, package in QT_LIBRARIES.items() if ctypes.util.find_library(name) is None)
+    return tuple(package for name, package in QT_LIBRARIES.items() if not _can_load(name))
+
+
+def _can_load(library: str) -> bool:
+    """Whether the dynamic linker finds a library, also in ``LD_LIBRARY_PATH``."""
+    try:
+        ctypes.CDLL(library)
+    except OSError:
+        return False
+    return True
 
 
 def _check_window() -> Iterator[Finding]:

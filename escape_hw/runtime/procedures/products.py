@@ -16,6 +16,7 @@ from escape_hw.io.fits.telemetry import LoopTelemetry, save_telemetry
 from escape_hw.io.provenance import file_sha256, format_utc
 from escape_hw.io.run_folder import RunFolder
 from escape_hw.report.run_report import REPORT, write_report
+from escape_hw.report.verdict import verdict_document
 from escape_hw.runtime.procedures.declaration import SavedRun
 from escape_hw.runtime.session.record import BenchRecord
 
@@ -69,7 +70,7 @@ def save_values(
     wall_seconds: float,
 ) -> SavedRun:
     """Save a result that consists of a few numbers, by their names, without products and report."""
-    content = {**values, "partial": False, "products": {}}
+    content = {**values, "partial": False, "products": {}, "verdict": None}
     document = _document(record, name, title, wall_seconds, content)
     folder.write_result(document)
     return SavedRun({**document, **folder.location_fields()})
@@ -87,6 +88,7 @@ def write_run_result(folder: RunFolder, document: Mapping[str, Any]) -> dict[str
 
     An aborted run gets no report, because that takes seconds; ``escape report`` builds it.
     """
+    document = {**document, "verdict": verdict_document(document)}
     if not document.get("partial"):
         folder.add_product("report", folder.file(REPORT))
     folder.write_result(document)
