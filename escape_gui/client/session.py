@@ -15,6 +15,7 @@ from escape_gui.client.availability import RequestContext
 from escape_gui.client.history import LoopHistory
 from escape_gui.client.product_library import ProductLibrary
 from escape_hw.errors import EscapeError
+from escape_hw.io.night_log import NightEntry
 from escape_hw.io.run_folder import default_runs_folder
 from escape_hw.remote.client import Connection
 from escape_hw.remote.source import DataSource, Sample
@@ -38,6 +39,9 @@ class EmptySource:
         return self._geometry
 
     def log_after(self, number: int) -> Sequence[LogLine]:
+        return ()
+
+    def night_after(self, number: int) -> Sequence[NightEntry]:
         return ()
 
     def procedures(self) -> Sequence[ProcedureEntry]:

@@ -64,6 +64,7 @@ def build_app() -> typer.Typer:
     app.command("show")(products.show)
     app.command("compare")(products.compare)
     app.command("report")(products.report)
+    app.command("night-log")(products.night_log)
     app.command("perf")(perf.perf)
     app.add_typer(dm.app, name="dm")
     app.add_typer(camera.app, name="camera")
