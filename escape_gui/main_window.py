@@ -47,7 +47,7 @@ from escape_hw.remote.state import State
 
 log = logging.getLogger(__name__)
 #: Version of the dock arrangement that Qt stores; layouts of other versions are discarded.
-LAYOUT_VERSION = 3
+LAYOUT_VERSION = 4
 #: Room that is left for the frame of the window manager.
 _FRAME = QSize(8, 32)
 #: Width of the coloured frame of a recorded run, and offset of its window, pixels.
@@ -87,7 +87,7 @@ class MainWindow(QMainWindow):
             self.context, self.actions_by_name["open_loop"], self.actions_by_name["flatten"]
         )
         self.fault_banner = FaultBanner(self.context, self.actions_by_name["clear_fault"])
-        self.alarms = AlarmMonitor(settings.alarms)
+        self.alarms = AlarmMonitor(settings.alarms, self._log_alarm)
         self.alarm_banner = AlarmBanner(self.context, self.actions_by_name["acknowledge"])
         self.alarm_dialog = AlarmDialog(self, settings)
         self.frozen_banner = FrozenBanner(self.context, self.actions_by_name["freeze"])
@@ -347,6 +347,12 @@ class MainWindow(QMainWindow):
         """Request control, from the client that has it if there is one."""
         held = self.context.session.source.state.lease is not None
         self.context.session.ask("take control", lambda server: server.acquire(take_over=held))
+
+    def _log_alarm(self, text: str) -> None:
+        """Add an alarm to the night log; of several windows, the one in control does."""
+        session = self.context.session
+        if session.may_write:
+            session.ask("log the alarm", lambda server: server.add_note(text, kind="alarm"), quiet=True)
 
     def toggle_recording(self) -> None:
         on = not self.context.session.source.state.recording.recording

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Self
 
 from matplotlib.figure import Figure
 
@@ -25,38 +26,47 @@ _CAPTIONS = {
 _KIND_WORDS = {"note": "note", "event": "", "fault": "FAULT", "alarm": "ALARM"}
 
 
+def read_nights(runs: Path, system: str, until: str = "") -> dict[str, Sequence[NightEntry]]:
+    """Entries of the last :data:`N_NIGHTS` nights of a system by date, up to that of ``until`` if given."""
+    paths = [path for path in find_nights(runs, system) if not until or path.parent.name <= until]
+    return {path.parent.name: read_night(path) for path in paths[:N_NIGHTS]}
+
+
 class NightReport:
     """Content of the report of one night.
 
     Parameters
     ----------
-    runs
-        Parent of the run folders.
     system
-        Name of the system; by default that of the newest night log.
+        Name of the system.
     night
-        Date of the evening, ``2026-11-22``; by default the newest one.
-
-    Raises
-    ------
-    ProductError
-        There is no such night log, or it cannot be read.
+        Date of the evening, ``2026-11-22``.
+    nights
+        Entries of this night and of those before it, by date.
     """
 
-    def __init__(self, runs: Path, system: str = "", night: str = "", n_nights: int = N_NIGHTS) -> None:
-        paths = [path for path in find_nights(runs, system or "*") if not night or path.parent.name <= night]
-        if not paths or (night and paths[0].parent.name != night):
+    def __init__(self, system: str, night: str, nights: Mapping[str, Sequence[NightEntry]]) -> None:
+        self.system, self.night, self.nights = system, night, nights
+        self.entries = nights[night]
+        self.simulated = any(entry.simulated for entry in self.entries)
+
+    @classmethod
+    def read(cls, runs: Path, system: str = "", night: str = "") -> Self:
+        """Read the report of a night; by default the newest one, of the system that was used last.
+
+        Raises
+        ------
+        ProductError
+            There is no such night log, or it cannot be read.
+        """
+        paths = [path for path in find_nights(runs, system or "*") if not night or path.parent.name == night]
+        if not paths:
             known = ", ".join(dict.fromkeys(path.parent.name for path in find_nights(runs))) or "none"
             what = " ".join(filter(None, (system, night))) or "any system"
             raise ProductError(f"{runs}: no night log of {what}; there are: {known}")
-        self.path = paths[0]
-        self.system, self.night = system_of(self.path), self.path.parent.name
-        self.entries = read_night(self.path)
-        self.simulated = any(entry.simulated for entry in self.entries)
-        earlier = [path for path in paths if path.name == self.path.name][:n_nights]
-        self.nights: dict[str, Sequence[NightEntry]] = {
-            path.parent.name: self.entries if path == self.path else read_night(path) for path in earlier
-        }
+        newest = max(paths, key=lambda path: (path.parent.name, path.stat().st_mtime))
+        system, night = system_of(newest), newest.parent.name
+        return cls(system, night, read_nights(runs, system, night))
 
     @property
     def title(self) -> str:

@@ -148,7 +148,7 @@ def night_log(
     from escape_hw.io.run_folder import default_runs_folder
     from escape_hw.report.night_log import NightReport
 
-    report = NightReport(runs or default_runs_folder(), system, night)
+    report = NightReport.read(runs or default_runs_folder(), system, night)
     files = () if out is None else report.write(out)
     if out is None:
         context.show(report.title, *(f"{name}: {value}" for name, value in report.summary().items()))
@@ -157,6 +157,6 @@ def night_log(
         context.show(*(f"written: {path}" for path in files))
     context.set_subject(report.system, report.simulated, None)
     context.report(
-        night=report.night, log=report.path, files=list(files),
+        night=report.night, files=list(files),
         entries=[entry.model_dump(mode="json", exclude_defaults=True) for entry in report.entries],
     )  # fmt: skip
