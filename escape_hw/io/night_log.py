@@ -54,6 +54,7 @@ QUANTITIES: dict[str, tuple[str, str]] = {
     "residual_nm": ("Residual", "nm rms"),
     "strength": ("D / r0 at the sensor's wavelength", ""),
     "r0_m": ("r0 at 500 nm", "m"),
+    "seeing": ("Seeing at 500 nm", "arcsec"),
     "shift_x": ("Shift x", "% of a sub-aperture"),
     "shift_y": ("Shift y", "% of a sub-aperture"),
     "rotation": ("Rotation", "degrees"),

@@ -597,9 +597,19 @@ class Connection:
         answer, _ = self._request("load_product", SLOW_TIMEOUT_S, path=str(path), name=name)
         return ProductEntry.model_validate(answer)
 
-    def record(self, on: bool) -> None:
-        """Start or stop recording telemetry at full rate."""
-        self._request("set_recording", SLOW_TIMEOUT_S, on=on)
+    def record(self, on: bool, *, images: bool = True, seconds: float | None = None) -> None:
+        """Start or stop recording telemetry at full rate.
+
+        Parameters
+        ----------
+        on
+            Start or stop; nothing happens if it is in that state already.
+        images
+            Record the frames of the cameras as well, which are most of the data.
+        seconds
+            Stop after this time; by default when requested.
+        """
+        self._request("set_recording", SLOW_TIMEOUT_S, on=on, images=images, seconds=seconds)
 
     def clear_fault(self) -> None:
         """Release the latched fault; closed devices are opened again."""

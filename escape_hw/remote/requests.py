@@ -164,6 +164,10 @@ class SetRecording(Request):
 
     verb: Literal["set_recording"] = "set_recording"
     on: bool
+    #: Record the frames of the cameras as well.
+    images: bool = True
+    #: Stop after this time; ``None``: when requested.
+    seconds: Annotated[float, Field(gt=0, le=86_400, allow_inf_nan=False)] | None = None
 
 
 AnyRequest = Annotated[

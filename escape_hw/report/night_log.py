@@ -11,7 +11,6 @@ from matplotlib.figure import Figure
 from escape_hw.errors import ConfigError, ProductError
 from escape_hw.io.night_log import QUANTITIES, NightEntry, find_nights, read_night, system_of
 from escape_hw.io.storage import make_folder, write_atomic
-from escape_hw.pipeline.seeing import seeing_arcsec
 from escape_hw.report import html
 from escape_hw.report.figures import style
 from escape_hw.report.figures.night import night_figure, nights_figure, summarise
@@ -84,15 +83,12 @@ class NightReport:
 
     def summary(self) -> dict[str, str]:
         """Median and central 68 % of every quantity, in words."""
-        found = summarise(self.entries)
         rows = {}
-        for name, (median, low, high) in found.items():
+        for name, (median, low, high) in summarise(self.entries).items():
             label, unit = QUANTITIES[name]
             scale = 100.0 if name == "r0_m" else 1.0
             unit = "cm" if name == "r0_m" else unit
             rows[label] = f"{scale * median:.3g} ({scale * low:.3g} to {scale * high:.3g}) {unit}".rstrip()
-        if "r0_m" in found and found["r0_m"][0] > 0.01:
-            rows["Seeing at 500 nm"] = f"{seeing_arcsec(found['r0_m'][0]):.2f} arcsec"
         return rows
 
     def figures(self) -> dict[str, Figure]:

@@ -34,7 +34,13 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
                 number=k + 1,
                 at_utc=format_utc(evening + timedelta(seconds=10 * k)),
                 kind="sample",
-                values={"strehl": 40.0 + k, "strength": 20.0, "r0_m": 0.1, "shift_x": -16.0 + k},
+                values={
+                    "strehl": 40.0 + k,
+                    "strength": 20.0,
+                    "r0_m": 0.1,
+                    "seeing": 1.01,
+                    "shift_x": -16.0 + k,
+                },
                 simulated=True,
             )
             for k in range(5)
@@ -54,7 +60,7 @@ def test_markdown_has_the_log_the_medians_and_figures_beside_it(runs: Path, tmp_
     content = text.read_text()
     assert "**SIMULATED**" in content
     assert "| Strehl ratio | 42 (40.6 to 43.4) % |" in content
-    assert "| Seeing at 500 nm | 1.01 arcsec |" in content
+    assert "| Seeing at 500 nm | 1.01 (1.01 to 1.01) arcsec |" in content
     assert "note, ana: <b>first light" in content
     assert "FAULT: no frame" in content
     assert [path.name for path in figures] == ["my night_night.png", "my night_nights.png"]

@@ -81,7 +81,7 @@ def _draw_series(panel: Axes, entries: Sequence[NightEntry], name: str, colour: 
 
 def summarise(entries: Sequence[NightEntry]) -> dict[str, tuple[float, float, float]]:
     """Median and percentiles 16 and 84 of every quantity of a night."""
-    names = dict.fromkeys(name for _, names in PANELS for name in (*names, "r0_m", "residual_nm"))
+    names = dict.fromkeys(name for _, names in PANELS for name in (*names, "r0_m", "seeing", "residual_nm"))
     found = {name: series(entries, name)[1] for name in names}
     return {
         name: tuple(float(one) for one in np.percentile(values, (50, 16, 84)))  # type: ignore[misc]

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from escape_hw.api.registration import PARAMETERS, TO_STREAM_UNITS
 from escape_hw.config.system import SystemConfig
 from escape_hw.errors import EscapeError
-from escape_hw.pipeline.seeing import fried_parameter, turbulence_strength, used_modes
+from escape_hw.pipeline.seeing import fried_parameter, seeing_arcsec, turbulence_strength, used_modes
 from escape_hw.remote.state import Phase, State
 from escape_hw.streams.ring import ReaderCache, RingReader, Sample
 from escape_hw.supervision import BackgroundThread
@@ -25,6 +25,8 @@ log = logging.getLogger(__name__)
 _PERIOD_S, _FRAMES = 0.2, 6
 #: Pairs of frames in an estimate of the seeing: those of about ten seconds, and the fewest.
 _MAX_PAIRS, _MIN_PAIRS = 200, 60
+#: Least r0 for which a seeing is given, metres: the turbulence of a bench has none.
+_MIN_SKY_R0_M = 0.01
 #: Delay of a loop whose matrix has no temporal response, frames.
 _DELAY_FRAMES = 2.0
 
@@ -143,6 +145,8 @@ class PerformanceSampler:
                 system = self._config.system
                 r0 = fried_parameter(strength, system.pupil_m, system.wavelength_m)
                 values |= {"strength": strength, "r0_m": r0}
+                if r0 > _MIN_SKY_R0_M:
+                    values["seeing"] = seeing_arcsec(r0)
         self._mode = mode
         with self._lock:
             self._values |= values
