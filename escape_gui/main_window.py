@@ -28,6 +28,7 @@ from escape_gui.client.session import Session
 from escape_gui.panels import PANELS
 from escape_gui.panels.base import Context, Panel
 from escape_gui.panels.loop import LoopPanel
+from escape_gui.panels.telemetry import TelemetryPanel
 from escape_gui.replay.playback import PlaybackBar, RecordingOpener
 from escape_gui.replay.source import ReplaySource
 from escape_gui.settings import Settings, save_settings
@@ -40,6 +41,7 @@ from escape_gui.window.docks import WORKSPACES, Dock, arrange_docks, hide_orphan
 from escape_gui.window.export import Exporter
 from escape_gui.window.header import AlarmBanner, ControlBanner, FaultBanner, FrozenBanner, HeaderBar
 from escape_gui.window.notifications import NotificationBar, StateNotifier
+from escape_gui.window.recording_browser import RecordingBrowser
 from escape_gui.window.run_browser import RunBrowser
 from escape_gui.window.update_timer import UpdateTimer
 from escape_hw.errors import StorageError
@@ -120,6 +122,11 @@ class MainWindow(QMainWindow):
         if isinstance(loop, LoopPanel):
             loop.load_button.clicked.connect(self.run_browser.open_list)
             self.run_browser.matrix_loaded.connect(lambda product: loop.choose_matrix(product.name))
+        self.recording_browser = RecordingBrowser(self, session)
+        telemetry = self.panels.get(TelemetryPanel.name)
+        if isinstance(telemetry, TelemetryPanel):
+            telemetry.browse_button.clicked.connect(self.recording_browser.open_list)
+            self.recording_browser.opened.connect(telemetry.open_recording)
         #: Windows in which recorded runs were opened from this one.
         self.replay_windows: list[MainWindow] = []
         #: Whether this window started the server, and whether that server goes on without the window.

@@ -165,7 +165,10 @@ WORKSPACES: tuple[Workspace, ...] = (
         "Closed loop, Strehl, latency",
         (
             Column((Cell(("loop",), 1.2), Cell(("devices", "procedure"), 1.0)), 0.9),
-            Column((Cell(("performance", "trends"), 1.4), Cell(("night", "log", "latency"), 0.9)), 1.5),
+            Column(
+                (Cell(("performance", "trends", "telemetry"), 1.4), Cell(("night", "log", "latency"), 0.9)),
+                1.5,
+            ),
             Column((Cell(("camera",), 1.0), Cell(("psf", "mirror"), 1.15)), 1.1),
         ),
     ),
