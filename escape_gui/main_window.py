@@ -326,7 +326,7 @@ class MainWindow(QMainWindow):
         telemetry = state.recording
         self._set_status(
             "recording",
-            f"recording {telemetry.written} frames, {telemetry.dropped} dropped"
+            f"recording {telemetry.size / 1e6:,.1f} MB, {telemetry.dropped} dropped"
             if telemetry.recording
             else "",
         )

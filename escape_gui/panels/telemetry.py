@@ -57,7 +57,7 @@ class TelemetryPanel(Panel):
         "residual by mode, spectra by Welch's method with the rejection of the integrator, gain by mode with "
         "the smallest residual (Gendron & Léna 1994, gain margin 2), suspicious actuators and sub-apertures. "
         "Without correction means the residual minus the commands that the sensor saw; the ratio of both "
-        "follows the integrator unless commands were clipped or the delay is another one. Recordings… lists "
+        "follows the integrator unless commands were clipped or the delay is another one. Open… lists "
         "earlier ones. The analysis needs the files on this computer."
     )
     rate_hz: ClassVar[float] = 2.0
@@ -113,8 +113,8 @@ class TelemetryPanel(Panel):
         self.seconds.setToolTip("Duration of the recording; 0: until stopped")
         self.images = QCheckBox("images")
         self.images.setToolTip("Record the frames of the cameras as well: most of the data")
-        self.browse_button = QPushButton("Recordings…")
-        self.browse_button.setToolTip("Open or delete earlier recordings")
+        self.browse_button = QPushButton("Open…")
+        self.browse_button.setToolTip("Browse the recordings: filter, open, delete")
         self.growth = caption()
 
     # ------------------------------------------------------------ recording
@@ -185,15 +185,19 @@ class TelemetryPanel(Panel):
         if analysis is None:
             self.source_label.setText("Record, or open a recording, to see its analysis.")
             return
-        place = "" if self._folder is None else f"{self._folder.parent.name} {self._folder.name}: "
-        self.source_label.setText(place + describe_analysis(analysis))
+        self.source_label.setText(describe_analysis(analysis, self._folder))
+        facts = analysis.facts
+        self.source_label.setToolTip(
+            f"{self._folder}\ngain {facts.gain:g}, leak {facts.leak:g}, "
+            f"delay {facts.delay_frames:.3g} frames, {facts.rate_hz:g} Hz"
+        )
         match self.view.selected:
             case "Residual":
                 self.residual.show_modes(analysis.residual_rms_nm, analysis.open_loop_rms_nm)
             case "Spectra":
                 self.spectra.show_spectra(self._spectra(analysis))
             case "Gains":
-                self.gains.show_gains(analysis.facts.gain, analysis.optimal_gain)
+                self.gains.show_gains(analysis.facts.gain, analysis.optimal_gain, analysis.largest_gain)
             case _:
                 self._fill_table(analysis)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -66,16 +67,16 @@ def describe_growth(recording: RecordingState, seconds: float) -> str:
     return " · ".join(parts)
 
 
-def describe_analysis(analysis: TelemetryAnalysis) -> str:
-    """Frames, loop and verdict of an analysis in a line."""
-    facts = analysis.facts
+def describe_analysis(analysis: TelemetryAnalysis, folder: Path | None) -> str:
+    """Time of the recording, frames, and what is missing, in a line."""
+    time = "" if folder is None else f"{folder.name[:2]}:{folder.name[2:4]}:{folder.name[4:6]} · "
     lost = f", {analysis.n_lost} lost" if analysis.n_lost else ""
-    loop = f"gain {facts.gain:g}, delay {facts.delay_frames:.2g} frames"
+    missing = ""
     if not analysis.mode_psd.shape[1]:
-        loop = "no residual: the loop was open"
+        missing = " · no residual: the loop was open"
     elif not analysis.open_loop_psd.shape[1]:
-        loop += "; its matrix cannot be read: no open-loop modes"
-    return f"{analysis.n_frames:,} frames, {analysis.seconds:.1f} s{lost} · {loop}"
+        missing = " · the matrix cannot be read: no modes without correction"
+    return f"{time}{analysis.n_frames:,} frames, {analysis.seconds:.1f} s{lost}{missing}"
 
 
 def suspicious_rows(analysis: TelemetryAnalysis, geometry: Geometry) -> list[tuple[str, str, str]]:

@@ -16,7 +16,7 @@ from escape_gui.widgets.controls import column, row, set_available, text_label
 if TYPE_CHECKING:
     from escape_hw.runtime.session.recordings import RecordingSummary
 
-COLUMNS = ("Date", "System", "Loop", "Frames", "Duration", "Streams", "Size")
+COLUMNS = ("Date", "System", "Loop", "Frames", "Duration", "Size", "Streams")
 _SUMMARY = Qt.ItemDataRole.UserRole
 
 
@@ -182,8 +182,8 @@ def _cells(one: RecordingSummary) -> list[tuple[str, float | str]]:
     streams = ", ".join(one.streams)
     return [
         (date, date), (system, system), (loop, loop), (f"{one.frames:,}", one.frames),
-        (f"{one.seconds:,.1f} s" if one.seconds else "", one.seconds), (streams, streams),
-        (_size_text(one.size), one.size),
+        (f"{one.seconds:,.1f} s" if one.seconds else "", one.seconds),
+        (_size_text(one.size), one.size), (streams, streams),
     ]  # fmt: skip
 
 

@@ -99,6 +99,11 @@ def rejection(
     return np.asarray(np.square(np.abs(1 / (1 + loop))))
 
 
+def largest_gain(delay_frames: float) -> float:
+    """Largest gain of an integrator with a gain margin of 2."""
+    return gain_limit(delay_frames) / _GAIN_MARGIN
+
+
 def optimal_gains(
     frequency_hz: NDArray[np.floating],
     density: NDArray[np.floating],
@@ -114,7 +119,7 @@ def optimal_gains(
 
     ``density``: spectra ``(n_frequencies, n_modes)`` of the open-loop modes.
     """
-    gains = np.geomspace(0.01, gain_limit(delay_frames) / _GAIN_MARGIN, _N_GAINS)
+    gains = np.geomspace(0.01, largest_gain(delay_frames), _N_GAINS)
     variance = rejection(frequency_hz, rate_hz, gains[:, None], leak, delay_frames) @ density
     return np.asarray(gains[np.argmin(variance, axis=0)])
 
@@ -287,6 +292,11 @@ class TelemetryAnalysis:
     optimal_gain: NDArray[np.float64]
     suspicious: tuple[SuspiciousElement, ...]
     __repr__ = short_repr
+
+    @property
+    def largest_gain(self) -> float:
+        """Upper limit of :attr:`optimal_gain`."""
+        return largest_gain(self.facts.delay_frames)
 
     @property
     def seconds(self) -> float:

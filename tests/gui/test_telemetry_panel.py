@@ -88,7 +88,7 @@ def test_a_recording_of_some_seconds_is_requested_grows_and_is_analysed(
     wait_for(lambda: panel.analysis is not None)
     assert panel.record_button.text() == "Record"
     assert "1,024 frames, 2.0 s" in panel.source_label.text()
-    assert "no open-loop modes" in panel.source_label.text()
+    assert "no modes without correction" in panel.source_label.text()
 
 
 def test_all_views_show_the_analysis_in_both_themes(
@@ -146,7 +146,7 @@ def test_recordings_are_filtered_opened_and_deleted_after_a_question(
     browser.table.selectRow(0)
     QTest.mouseClick(browser.open_button, Qt.MouseButton.LeftButton)
     wait_for(lambda: panel.analysis is not None)
-    assert panel.source_label.text().startswith("2026-11-22 220000_telemetry")
+    assert panel.source_label.text().startswith("22:00:00 · 1,024 frames")
 
 
 def test_a_recording_that_goes_on_is_not_deleted(
