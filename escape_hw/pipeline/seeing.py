@@ -69,7 +69,7 @@ def turbulence_strength(pairs_rad: NDArray[np.floating], n_modes: int) -> float:
 
 def fried_parameter(strength: float, pupil_m: float, wavelength_m: float) -> float:
     """Fried parameter r0 in metres at 500 nm from ``D / r0`` at a wavelength: r0 rises as ``lambda^1.2``."""
-    return pupil_m / strength * (REFERENCE_WAVELENGTH_M / wavelength_m) ** 1.2
+    return float(pupil_m / strength * (REFERENCE_WAVELENGTH_M / wavelength_m) ** 1.2)
 
 
 def seeing_arcsec(r0_m: float) -> float:
