@@ -57,7 +57,7 @@ class TrendsPlot(PlotGrid):
         self._items: dict[str, ErrorCurve | pg.PlotDataItem] = {}
         self._lines: list[tuple[pg.PlotItem, pg.InfiniteLine]] = []
         self._drawn_marks: list[tuple[float, str]] = []
-        self._plots = []
+        self._plots: list[pg.PlotItem] = []
         for line, trend in enumerate(TRENDS):
             plot = self.add_plot(line)
             is_last = line == len(TRENDS) - 1

@@ -52,9 +52,10 @@ def night_figure(entries: Sequence[NightEntry]) -> Figure | None:
                 panel.axvline(entry.time.astimezone(), color=style.SERIES[5], lw=1.0)
             elif entry.kind == "note":
                 panel.axvline(entry.time.astimezone(), color=style.MUTED, lw=0.8, ls=":")
-    locator = AutoDateLocator(tz=entries[0].time.astimezone().tzinfo)
+    locator = AutoDateLocator(tz=entries[0].time.astimezone().tzinfo)  # type: ignore[no-untyped-call]
     axes[-1].xaxis.set_major_locator(locator)
-    axes[-1].xaxis.set_major_formatter(ConciseDateFormatter(locator, tz=locator.tz))
+    formatter = ConciseDateFormatter(locator, tz=locator.tz)  # type: ignore[no-untyped-call]
+    axes[-1].xaxis.set_major_formatter(formatter)
     axes[-1].set_xlabel("local time; dotted: notes, red: faults and alarms")
     return figure
 
@@ -68,13 +69,12 @@ def _draw_series(panel: Axes, entries: Sequence[NightEntry], name: str, colour: 
     label = name.removeprefix("shift_")
     if name in _RELATIVE and values:
         values = [value - values[0] for value in values]
+    numbers = np.asarray(date2num(times), float)  # type: ignore[no-untyped-call]
     if name in _SPARSE:
         sigma = [entry.values.get(f"{name}_sigma", np.nan) for entry in entries if name in entry.values]
-        panel.errorbar(
-            date2num(times), values, np.nan_to_num(sigma), fmt="o", ms=3, lw=1, color=colour, label=label
-        )
+        panel.errorbar(numbers, values, np.nan_to_num(sigma), fmt="o", ms=3, lw=1, color=colour, label=label)
         return
-    numbers, drawn = date2num(times), np.array(values, float)
+    drawn = np.array(values, float)
     gaps = np.flatnonzero(np.diff(numbers) > _GAP.total_seconds() / 86400) + 1
     panel.plot(np.insert(numbers, gaps, np.nan), np.insert(drawn, gaps, np.nan), color=colour, lw=1.1)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -47,7 +47,9 @@ def read_description(folder: Path) -> RecordingDescription:
     """Read the description; recordings of version 0.1.0, and damaged files, have an empty one."""
     try:
         document = json.loads((folder / DESCRIPTION_FILE).read_text(encoding="utf-8"))
-        known = {one.name: type(one.default) for one in fields(RecordingDescription)}
+        known: dict[str, type] = {
+            name: type(default) for name, default in asdict(RecordingDescription()).items()
+        }
         return RecordingDescription(
             **{name: known[name](value) for name, value in document.items() if name in known}
         )
@@ -124,12 +126,13 @@ def load_recording(folder: Path, max_frames: int = MAX_FRAMES) -> tuple[LoopTele
         raise ProductError(f"{folder}: no slopes are recorded yet; the sensor must have been measured before")
     # The index starts again when the camera restarts.
     restart = int(np.max(np.flatnonzero(np.diff(slopes.index) <= 0), initial=-1)) + 1
-    index, arrived, data = (array[restart:] for array in (slopes.index, slopes.arrived_ns, slopes.data))
+    index, arrived, data = slopes.index[restart:], slopes.arrived_ns[restart:], slopes.data[restart:]
     residual, commands = (_newest(folder, name, 2 * max_frames) for name in ("residual_modes", "commands"))
     modes = np.zeros((len(index), 0), np.float32)
     if residual is not None and residual.arrived_ns[-1] >= arrived[0]:
-        common, at, among = np.intersect1d(index, residual.index, return_indices=True)
-        index, arrived, data, modes = common, arrived[at], data[at], residual.data[among]
+        recent = residual.arrived_ns >= arrived[0]
+        _, at, among = np.intersect1d(index, residual.index[recent], return_indices=True)
+        index, arrived, data, modes = index[at], arrived[at], data[at], residual.data[recent][among]
     sent = np.zeros((len(index), 0), np.float32)
     if commands is not None and len(index):
         after = np.searchsorted(commands.arrived_ns, arrived)

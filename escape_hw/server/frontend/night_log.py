@@ -100,7 +100,7 @@ class NightLog:
 
 def values_of_run(document: Mapping[str, Any]) -> dict[str, float]:
     """Registration, median optical gain and Strehl ratio in % of a run's document."""
-    values: dict[str, float] = {}
+    values: dict[str, Any] = {}
     registration = document.get("registration")
     if isinstance(registration, Mapping) and document.get("converged", True):
         for name in PARAMETERS:
@@ -109,7 +109,7 @@ def values_of_run(document: Mapping[str, Any]) -> dict[str, float]:
     gains = document.get("optical_gain")
     if isinstance(gains, list):
         finite = [float(gain) for gain in gains if gain is not None]
-        values["optical_gain"] = statistics.median(finite) if finite else None  # type: ignore[assignment]
+        values["optical_gain"] = statistics.median(finite) if finite else None
     strehl = document.get("strehl")
     if isinstance(strehl, Mapping):
         peak = strehl.get("peak") or {}
