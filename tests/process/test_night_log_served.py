@@ -5,6 +5,7 @@ from __future__ import annotations
 from serving import serving, until_idle, wait_for
 
 from escape_hw.io.night_log import find_nights, read_night
+from escape_hw.runtime.session.recordings import find_recordings
 
 
 def test_notes_and_events_survive_the_front_end(system, tmp_path) -> None:
@@ -16,6 +17,16 @@ def test_notes_and_events_survive_the_front_end(system, tmp_path) -> None:
         run = client.start("docrime", frames=300)
         run.wait(120)
         wait_for(lambda: any("run 1, docrime: done" in one.text for one in client.night_after(-1)), "logged")
+        # A recording of some time, without the frames of the cameras.
+        client.record(True, images=False, seconds=0.5)
+        wait_for(lambda: bool(client.state.recording.path), "it records")
+        wait_for(lambda: not client.state.recording.recording, "the recording ends by itself")
+        assert client.state.recording.fault == ""
+        (recording,) = find_recordings(tmp_path / "data" / "escape" / "runs")
+        assert "frames" not in recording.streams
+        assert recording.size == client.state.recording.size
+        assert recording.description.simulated
+        assert recording.description.rate_hz > 0
         (path,) = find_nights(tmp_path / "data" / "escape" / "runs")
         assert "first light" in [entry.text for entry in read_night(path)]
         front = served.front

@@ -69,7 +69,7 @@ def _draw_series(panel: Axes, entries: Sequence[NightEntry], name: str, colour: 
     label = name.removeprefix("shift_")
     if name in _RELATIVE and values:
         values = [value - values[0] for value in values]
-    numbers = np.asarray(date2num(times), float)  # type: ignore[no-untyped-call]
+    numbers = np.asarray(date2num(times), np.float64)  # type: ignore[no-untyped-call]
     if name in _SPARSE:
         sigma = [entry.values.get(f"{name}_sigma", np.nan) for entry in entries if name in entry.values]
         panel.errorbar(numbers, values, np.nan_to_num(sigma), fmt="o", ms=3, lw=1, color=colour, label=label)
