@@ -31,7 +31,7 @@ def entry(
 
 
 def wait_for(done) -> None:
-    for _ in range(400):
+    for _ in range(12_000):
         if done():
             return
         QTest.qWait(10)

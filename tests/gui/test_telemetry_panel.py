@@ -21,7 +21,7 @@ from escape_hw.streams.recording.block_file import HEADER, write_block
 
 
 def wait_for(done: Callable[[], object]) -> None:
-    for _ in range(600):
+    for _ in range(12_000):
         if done():
             return
         QTest.qWait(10)
