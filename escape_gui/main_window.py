@@ -28,6 +28,7 @@ from escape_gui.client.session import Session
 from escape_gui.panels import PANELS
 from escape_gui.panels.base import Context, Panel
 from escape_gui.panels.loop import LoopPanel
+from escape_gui.panels.telemetry import TelemetryPanel
 from escape_gui.replay.playback import PlaybackBar, RecordingOpener
 from escape_gui.replay.source import ReplaySource
 from escape_gui.settings import Settings, save_settings
@@ -40,6 +41,7 @@ from escape_gui.window.docks import WORKSPACES, Dock, arrange_docks, arrange_tab
 from escape_gui.window.export import Exporter
 from escape_gui.window.header import AlarmBanner, ControlBanner, FaultBanner, FrozenBanner, HeaderBar
 from escape_gui.window.notifications import NotificationBar, StateNotifier
+from escape_gui.window.recording_browser import RecordingBrowser
 from escape_gui.window.run_browser import RunBrowser
 from escape_gui.window.update_timer import UpdateTimer
 from escape_hw.errors import StorageError
@@ -47,7 +49,7 @@ from escape_hw.remote.state import State
 
 log = logging.getLogger(__name__)
 #: Version of the dock arrangement that Qt stores; layouts of other versions are discarded.
-LAYOUT_VERSION = 3
+LAYOUT_VERSION = 4
 #: Room that is left for the frame of the window manager.
 _FRAME = QSize(8, 32)
 #: Width of the coloured frame of a recorded run, and offset of its window, pixels.
@@ -87,7 +89,7 @@ class MainWindow(QMainWindow):
             self.context, self.actions_by_name["open_loop"], self.actions_by_name["flatten"]
         )
         self.fault_banner = FaultBanner(self.context, self.actions_by_name["clear_fault"])
-        self.alarms = AlarmMonitor(settings.alarms)
+        self.alarms = AlarmMonitor(settings.alarms, self._log_alarm)
         self.alarm_banner = AlarmBanner(self.context, self.actions_by_name["acknowledge"])
         self.alarm_dialog = AlarmDialog(self, settings)
         self.frozen_banner = FrozenBanner(self.context, self.actions_by_name["freeze"])
@@ -120,6 +122,11 @@ class MainWindow(QMainWindow):
         if isinstance(loop, LoopPanel):
             loop.load_button.clicked.connect(self.run_browser.open_list)
             self.run_browser.matrix_loaded.connect(lambda product: loop.choose_matrix(product.name))
+        self.recording_browser = RecordingBrowser(self, session)
+        telemetry = self.panels.get(TelemetryPanel.name)
+        if isinstance(telemetry, TelemetryPanel):
+            telemetry.browse_button.clicked.connect(self.recording_browser.open_list)
+            self.recording_browser.opened.connect(telemetry.open_recording)
         #: Windows in which recorded runs were opened from this one.
         self.replay_windows: list[MainWindow] = []
         #: Whether this window started the server, and whether that server goes on without the window.
@@ -321,7 +328,7 @@ class MainWindow(QMainWindow):
         telemetry = state.recording
         self._set_status(
             "recording",
-            f"recording {telemetry.written} frames, {telemetry.dropped} dropped"
+            f"recording {telemetry.size / 1e6:,.1f} MB, {telemetry.dropped} dropped"
             if telemetry.recording
             else "",
         )
@@ -349,6 +356,12 @@ class MainWindow(QMainWindow):
         """Request control, from the client that has it if there is one."""
         held = self.context.session.source.state.lease is not None
         self.context.session.ask("take control", lambda server: server.acquire(take_over=held))
+
+    def _log_alarm(self, text: str) -> None:
+        """Add an alarm to the night log; of several windows, the one in control does."""
+        session = self.context.session
+        if session.may_write:
+            session.ask("log the alarm", lambda server: server.add_note(text, kind="alarm"), quiet=True)
 
     def toggle_recording(self) -> None:
         on = not self.context.session.source.state.recording.recording

@@ -75,11 +75,14 @@ RULES = (
 class AlarmMonitor:
     """Raises alarms from states; an alarm stays until it was acknowledged and its reason has passed.
 
-    ``limits``: limit by name of the rule; rules without a limit are off. The mapping may change.
+    ``limits``: limit by name of the rule; rules without a limit are off. The mapping may change. ``on_event``
+    is called with a text when an alarm is raised or acknowledged.
     """
 
-    def __init__(self, limits: Mapping[str, float]) -> None:
-        self._limits = limits
+    def __init__(
+        self, limits: Mapping[str, float], on_event: Callable[[str], object] = lambda text: None
+    ) -> None:
+        self._limits, self._on_event = limits, on_event
         self._counts = dict.fromkeys((rule.name for rule in RULES), 0)
         self._raised: dict[str, str] = {}
         self._acknowledged: set[str] = set()
@@ -107,9 +110,11 @@ class AlarmMonitor:
             if self._counts[rule.name] >= _STATES and rule.name not in self._raised:
                 self._raised[rule.name] = f"{rule.describe(value, limit)}, since {datetime.now():%H:%M:%S}"
                 log.warning("ALARM: %s", self._raised[rule.name])
+                self._on_event(self._raised[rule.name])
 
     def acknowledge(self) -> None:
         """Acknowledge all alarms."""
         for text in self.unacknowledged:
             log.warning("acknowledged: %s", text)
+            self._on_event(f"acknowledged: {text}")
         self._acknowledged |= self._raised.keys()

@@ -16,6 +16,7 @@ from typing import IO
 from PySide6.QtCore import QObject, Signal
 
 from escape_hw.errors import EscapeError
+from escape_hw.io.night_log import NightEntry
 from escape_hw.remote.address import find_server
 from escape_hw.remote.client import Connection, connect
 from escape_hw.remote.source import Sample
@@ -69,6 +70,9 @@ class LiveSource:
 
     def log_after(self, number: int) -> Sequence[LogLine]:
         return self.connection.log_after(number)
+
+    def night_after(self, number: int) -> Sequence[NightEntry]:
+        return self.connection.night_after(number)
 
     def procedures(self) -> Sequence[ProcedureEntry]:
         """Available procedures; empty until they were fetched."""

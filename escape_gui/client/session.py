@@ -15,6 +15,7 @@ from escape_gui.client.availability import RequestContext
 from escape_gui.client.history import LoopHistory
 from escape_gui.client.product_library import ProductLibrary
 from escape_hw.errors import EscapeError
+from escape_hw.io.night_log import NightEntry
 from escape_hw.io.run_folder import default_runs_folder
 from escape_hw.remote.client import Connection
 from escape_hw.remote.source import DataSource, Sample
@@ -38,6 +39,9 @@ class EmptySource:
         return self._geometry
 
     def log_after(self, number: int) -> Sequence[LogLine]:
+        return ()
+
+    def night_after(self, number: int) -> Sequence[NightEntry]:
         return ()
 
     def procedures(self) -> Sequence[ProcedureEntry]:
@@ -70,6 +74,8 @@ class Session(QObject):
         self.library = ProductLibrary()
         self._executors: dict[bool, ThreadPoolExecutor] = {}
         self._pending = 0
+        self._computing: ThreadPoolExecutor | None = None
+        self._closed = False
         self._delivered.connect(lambda deliver: deliver(), Qt.ConnectionType.QueuedConnection)
 
     def set_source(self, source: DataSource, control: Connection | None) -> None:
@@ -130,6 +136,30 @@ class Session(QObject):
         future = self._executors[urgent].submit(call, control)
         future.add_done_callback(lambda answer: self._delivered.emit(partial(deliver, answer)))
 
+    def compute(
+        self,
+        call: Callable[[], T],
+        on_result: Callable[[T], None],
+        on_error: Callable[[str], None] = lambda reason: None,
+    ) -> None:
+        """Run a slow function in a worker thread; its result or error is delivered in the window's thread."""
+
+        def deliver(future: Future[T]) -> None:
+            if self._closed or future.cancelled():
+                return
+            error = future.exception()
+            if error is None:
+                on_result(future.result())
+                return
+            if not isinstance(error, EscapeError | ValueError):
+                log.error("a computation failed unexpectedly", exc_info=error)
+            on_error(str(error) or type(error).__name__)
+
+        if self._computing is None:
+            self._computing = ThreadPoolExecutor(1, "escape-gui-compute")
+        future = self._computing.submit(call)
+        future.add_done_callback(lambda answer: self._delivered.emit(partial(deliver, answer)))
+
     def _set_pending(self, number: int) -> None:
         self._pending = number
         self.pending_changed.emit(number)
@@ -163,7 +193,11 @@ class Session(QObject):
         return RequestContext(self.source.state, self.source.connected, self.live, self.may_write)
 
     def close(self) -> None:
+        self._closed = True
         self._close_requests()
+        if self._computing is not None:
+            self._computing.shutdown(wait=True, cancel_futures=True)
+            self._computing = None
         self.library.close()
         self.source = EmptySource()
 

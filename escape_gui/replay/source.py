@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from escape_hw.api.optical_gains import GainsResult
 from escape_hw.api.registration import PARAMETERS, TO_STREAM_UNITS
 from escape_hw.api.results import CalibrationResult, LoopResult, RegistrationEstimate
+from escape_hw.io.night_log import NightEntry
 from escape_hw.remote.source import STREAMS, Sample
 from escape_hw.remote.state import (
     ActiveRun,
@@ -241,6 +242,9 @@ class ReplaySource:
 
     def log_after(self, number: int) -> Sequence[LogLine]:
         return self._log[max(0, number + 1) :]
+
+    def night_after(self, number: int) -> Sequence[NightEntry]:
+        return ()
 
     def procedures(self) -> Sequence[ProcedureEntry]:
         return ()

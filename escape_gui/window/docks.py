@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 from PySide6.QtCore import QSize, Qt, Signal
 from PySide6.QtWidgets import (
@@ -165,7 +166,10 @@ WORKSPACES: tuple[Workspace, ...] = (
         "Closed loop, Strehl, latency",
         (
             Column((Cell(("loop",), 1.2), Cell(("devices", "procedure"), 1.0)), 0.9),
-            Column((Cell(("performance",), 1.4), Cell(("log", "latency"), 0.8)), 1.5),
+            Column(
+                (Cell(("performance", "trends", "telemetry"), 1.4), Cell(("night", "log", "latency"), 0.9)),
+                1.5,
+            ),
             Column((Cell(("camera",), 1.0), Cell(("psf", "mirror"), 1.15)), 1.1),
         ),
     ),
@@ -231,15 +235,14 @@ def _front_dock(docks: dict[str, QDockWidget], cell: Cell) -> QDockWidget:
 
 
 def _stack_cells(window: QMainWindow, docks: dict[str, QDockWidget], cells: list[Cell]) -> None:
-    above = _front_dock(docks, cells[0])
-    for cell in cells:
-        front = _front_dock(docks, cell)
-        if front is not above:
-            window.splitDockWidget(above, front, Qt.Orientation.Vertical)
+    fronts = [_front_dock(docks, cell) for cell in cells]
+    # Qt does not split docks that are tabs.
+    for above, front in pairwise(fronts):
+        window.splitDockWidget(above, front, Qt.Orientation.Vertical)
+    for cell, front in zip(cells, fronts, strict=True):
         for name in cell.names:
             if name in docks and docks[name] is not front:
                 window.tabifyDockWidget(front, docks[name])
-        above = front
 
 
 def _resize_docks(

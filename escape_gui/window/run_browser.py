@@ -8,36 +8,22 @@ from pathlib import Path
 from PySide6.QtCore import Qt, QUrl, Signal
 from PySide6.QtGui import QDesktopServices
 from PySide6.QtWidgets import (
-    QAbstractItemView,
     QDialog,
     QFileDialog,
-    QHeaderView,
     QLineEdit,
     QPushButton,
     QTableWidget,
-    QTableWidgetItem,
     QWidget,
 )
 
 from escape_gui.client.availability import reason_no_change
 from escape_gui.client.session import Session, runs_folder
 from escape_gui.views.run_list import COLUMNS, RunSummary, read_runs
+from escape_gui.widgets.browser_table import Cell, browser_table
 from escape_gui.widgets.controls import column, row, set_available, text_label
 from escape_hw.remote.state import ProductEntry
 
 _SUMMARY = Qt.ItemDataRole.UserRole
-
-
-class _Cell(QTableWidgetItem):
-    """A cell that is sorted by its value."""
-
-    def __init__(self, text: str, value: float | str) -> None:
-        super().__init__(text)
-        self._value = value
-        self.setFlags(Qt.ItemFlag.ItemIsSelectable | Qt.ItemFlag.ItemIsEnabled)
-
-    def __lt__(self, other: QTableWidgetItem) -> bool:
-        return isinstance(other, _Cell) and self._value < other._value  # type: ignore[operator]
 
 
 class RunBrowser(QDialog):
@@ -78,16 +64,7 @@ class RunBrowser(QDialog):
         self._enable()
 
     def _make_table(self) -> QTableWidget:
-        table = QTableWidget(0, len(COLUMNS))
-        table.setHorizontalHeaderLabels(COLUMNS)
-        table.setSelectionBehavior(QAbstractItemView.SelectionBehavior.SelectRows)
-        table.setSelectionMode(QAbstractItemView.SelectionMode.SingleSelection)
-        table.setShowGrid(False)
-        table.setTabKeyNavigation(False)
-        table.verticalHeader().hide()
-        table.horizontalHeader().setSectionResizeMode(QHeaderView.ResizeMode.ResizeToContents)
-        table.horizontalHeader().setStretchLastSection(True)
-        table.setAccessibleName("Runs")
+        table = browser_table(COLUMNS, "Runs")
         table.itemSelectionChanged.connect(self._enable)
         table.itemDoubleClicked.connect(lambda _: self.load_selected())
         return table
@@ -113,7 +90,7 @@ class RunBrowser(QDialog):
             values: tuple[float | str, ...]
             values = (run.date, run.name, run.system, run.method, run.frames, quality, run.size_mb)
             for k, text in enumerate(run.cells):
-                cell = _Cell(text, values[k])
+                cell = Cell(text, values[k])
                 cell.setData(_SUMMARY, run)
                 cell.setToolTip(run.verdict)
                 self.table.setItem(line, k, cell)

@@ -65,6 +65,7 @@ def build_app() -> typer.Typer:
     app.command("compare")(products.compare)
     app.command("report")(products.report)
     app.command("influence")(influence.influence)
+    app.command("night-log")(products.night_log)
     app.command("perf")(perf.perf)
     app.add_typer(dm.app, name="dm")
     app.add_typer(camera.app, name="camera")

@@ -14,6 +14,7 @@ import uuid
 from collections import deque
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
+from itertools import takewhile
 from pathlib import Path
 from typing import Any, Self
 
@@ -22,6 +23,7 @@ import numpy as np
 from escape_hw.api.procedure import Progress
 from escape_hw.deprecation import renamed_members
 from escape_hw.errors import Aborted, CalibrationError, ClientUnknown, EscapeError, ServerFull, ServerGone
+from escape_hw.io.night_log import NightEntry
 from escape_hw.remote import requests as ask
 from escape_hw.remote.address import Endpoint, resolve
 from escape_hw.remote.keys import client_keys, keys_hint
@@ -177,6 +179,8 @@ TIMEOUT_S, SLOW_TIMEOUT_S = 3.0, 30.0
 #: Silence after which a server counts as disconnected; it publishes its state five times a second.
 _STALE_S = 2.0
 _LINES = 5000
+#: Entries of the night log that are kept: more than two nights.
+_NIGHT_ENTRIES = 20_000
 #: Longest wait for the reply to the last request, seconds.
 _GOODBYE_S = 1.0
 #: Longest wait for the state that belongs to a reply, seconds.
@@ -221,6 +225,7 @@ class Connection:
         self._changed = threading.Condition()
         self._state = State()
         self._log: deque[LogLine] = deque(maxlen=_LINES)
+        self._night: deque[NightEntry] = deque(maxlen=_NIGHT_ENTRIES)
         self._ended: dict[int, FinishedRun] = {}
         self._geometry: tuple[object, Geometry] | None = None
         self._procedures: tuple[ProcedureEntry, ...] | None = None
@@ -247,6 +252,17 @@ class Connection:
             known = {line.number for line in self._log}
             old = [LogLine.model_validate(line) for line in lines if line["number"] not in known]
             self._log = deque(sorted((*old, *self._log), key=lambda line: line.number), maxlen=_LINES)
+        self._read_night_log()
+
+    def _read_night_log(self) -> None:
+        """Read the entries of the night log that this client does not have."""
+        new, last = [], self._night[-1].number if self._night else -1
+        while answer := self._request("night_log", after=last)[0]:
+            new += [NightEntry.model_validate(entry) for entry in answer]
+            last = new[-1].number
+        with self._changed:
+            known = {entry.number: entry for entry in (*self._night, *new)}
+            self._night = deque((known[number] for number in sorted(known)), maxlen=_NIGHT_ENTRIES)
 
     def _registration(self) -> Mapping[str, Any]:
         name, host = (re.sub(r"[^\w .+@:-]", "-", text)[:80] for text in (self._name, socket.gethostname()))
@@ -318,6 +334,10 @@ class Connection:
                 line = LogLine.model_validate(document)
                 if not self._log or line.number > self._log[-1].number:
                     self._log.append(line)
+            elif topic == "night":
+                entry = NightEntry.model_validate(document)
+                if not self._night or entry.number > self._night[-1].number:
+                    self._night.append(entry)
             elif topic == "progress":
                 running = ActiveRun.model_validate(document)
                 self._state = self._state.model_copy(update={"active_run": running})
@@ -379,6 +399,18 @@ class Connection:
         """Log lines with a larger number."""
         with self._changed:
             return [line for line in self._log if line.number > number]
+
+    def night_after(self, number: int) -> Sequence[NightEntry]:
+        """Entries of the night log with a larger number: notes, events and samples of the performance."""
+        with self._changed:
+            # New entries are at the end, and few.
+            new = list(takewhile(lambda entry: entry.number > number, reversed(self._night)))
+        return new[::-1]
+
+    def add_note(self, text: str, kind: str = "note") -> NightEntry:
+        """Add a note to the night log of the server; needs no control. ``kind`` is ``note`` or ``alarm``."""
+        answer, _ = self._request("add_note", text=text, kind=kind)
+        return NightEntry.model_validate(answer)
 
     def procedures(self) -> Sequence[ProcedureEntry]:
         """The procedures with their parameters."""
@@ -565,9 +597,19 @@ class Connection:
         answer, _ = self._request("load_product", SLOW_TIMEOUT_S, path=str(path), name=name)
         return ProductEntry.model_validate(answer)
 
-    def record(self, on: bool) -> None:
-        """Start or stop recording telemetry at full rate."""
-        self._request("set_recording", SLOW_TIMEOUT_S, on=on)
+    def record(self, on: bool, *, images: bool = True, seconds: float | None = None) -> None:
+        """Start or stop recording telemetry at full rate.
+
+        Parameters
+        ----------
+        on
+            Start or stop; nothing happens if it is in that state already.
+        images
+            Record the frames of the cameras as well, which are most of the data.
+        seconds
+            Stop after this time; by default when requested.
+        """
+        self._request("set_recording", SLOW_TIMEOUT_S, on=on, images=images, seconds=seconds)
 
     def clear_fault(self) -> None:
         """Release the latched fault; closed devices are opened again."""

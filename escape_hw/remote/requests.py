@@ -9,6 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 import escape_hw.errors as errors
 from escape_hw.config.system import MAX_GAIN
 from escape_hw.errors import ConfigError
+from escape_hw.io.night_log import MAX_TEXT
 from escape_hw.remote.state import Arguments
 
 #: Names of products, procedures and clients.
@@ -92,6 +93,22 @@ class GetLatestSample(Request):
     after: int = -1
 
 
+class GetNightLog(Request):
+    """Answered with the first ``count`` :class:`~escape_hw.io.night_log.NightEntry` after a number."""
+
+    verb: Literal["night_log"] = "night_log"
+    after: int = -1
+    count: Annotated[int, Field(ge=1, le=1000)] = 1000
+
+
+class AddNote(Request):
+    """Add a note of the operator, or an alarm of a window, to the night log; answered with the entry."""
+
+    verb: Literal["add_note"] = "add_note"
+    text: Annotated[str, Field(min_length=1, max_length=MAX_TEXT)]
+    kind: Literal["note", "alarm"] = "note"
+
+
 class AcquireLease(Request):
     """Acquire the lease; refused while another client holds it."""
 
@@ -147,11 +164,15 @@ class SetRecording(Request):
 
     verb: Literal["set_recording"] = "set_recording"
     on: bool
+    #: Record the frames of the cameras as well.
+    images: bool = True
+    #: Stop after this time; ``None``: when requested.
+    seconds: Annotated[float, Field(gt=0, le=86_400, allow_inf_nan=False)] | None = None
 
 
 AnyRequest = Annotated[
-    PlainRequest | RegisterClient | GetLog | GetLatestSample | AcquireLease | ProcedureRequest | CloseLoop
-    | SetLoop | LoadProduct | SetRecording,
+    PlainRequest | RegisterClient | GetLog | GetNightLog | AddNote | GetLatestSample | AcquireLease
+    | ProcedureRequest | CloseLoop | SetLoop | LoadProduct | SetRecording,
     Field(discriminator="verb"),
 ]  # fmt: skip
 

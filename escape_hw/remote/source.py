@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Protocol
 
 from escape_hw.deprecation import renamed_text, warn_renamed
+from escape_hw.io.night_log import NightEntry
 from escape_hw.remote.state import Geometry, LogLine, ProcedureEntry, State
 from escape_hw.streams.ring import Sample
 
@@ -35,6 +36,10 @@ class DataSource(Protocol):
 
     def log_after(self, number: int) -> Sequence[LogLine]:
         """Log lines with a larger number."""
+        ...
+
+    def night_after(self, number: int) -> Sequence[NightEntry]:
+        """Entries of the night log with a larger number."""
         ...
 
     def procedures(self) -> Sequence[ProcedureEntry]:

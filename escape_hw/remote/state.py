@@ -226,6 +226,9 @@ class RecordingState(StateDocument):
     written: int = 0
     #: Entries that were not written because the disk was too slow.
     dropped: int = 0
+    #: Bytes on disk.
+    size: int = 0
+    started_utc: str = ""
     #: Why the last recording ended without a request, such as a full disk.
     fault: str = ""
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from escape_hw.errors import EscapeError
+from escape_hw.io.night_log import NightEntry
 from escape_hw.remote.source import Sample
 from escape_hw.remote.state import (
     Arguments,
@@ -176,6 +177,7 @@ class ScriptedSource:
         self.state = state or running()
         self.geometry_data = geometry or shack_hartmann()
         self.lines: list[LogLine] = []
+        self.night: list[NightEntry] = []
         self.entries: tuple[ProcedureEntry, ...] = ()
         self.streams: dict[str, Sample] = {}
         self.reads = 0
@@ -236,6 +238,10 @@ class ScriptedSource:
     def log_after(self, number: int) -> Sequence[LogLine]:
         """Log lines after a number."""
         return [line for line in self.lines if line.number > number]
+
+    def night_after(self, number: int) -> Sequence[NightEntry]:
+        """Entries of the night log after a number."""
+        return [entry for entry in self.night if entry.number > number]
 
     def procedures(self) -> Sequence[ProcedureEntry]:
         """The procedures set by the test."""

@@ -225,6 +225,14 @@ def test_a_process_ends_with_its_streams(tmp_path):
     assert state.fault == ""
 
 
+def test_a_process_ends_after_its_time(tmp_path, writer):
+    recorder = RecorderProcess(tmp_path, {"slopes": writer.name}, seconds=0.3)
+    _until((tmp_path / "slopes.blocks").exists)
+    entries(writer, 0, 10, wait_s=0.001)
+    _until(lambda: not recorder.running)
+    assert (recorder.stop().fault, recorder.stop().written) == ("", 10)
+
+
 def test_a_process_that_cannot_begin_is_reported(tmp_path, capfd):
     recorder = RecorderProcess(tmp_path, {"slopes": segment_name(SYSTEM, "absent")})
     _until(lambda: not recorder.running)

@@ -1,4 +1,4 @@
-"""``escape show``, ``escape compare`` and ``escape report``."""
+"""``escape show``, ``escape compare``, ``escape report`` and ``escape night-log``."""
 
 from __future__ import annotations
 
@@ -135,3 +135,37 @@ def report(
         files["picture"] = write_picture(run, picture).absolute()
         context.show(f"picture: {picture}")
     context.report(**files)
+
+
+@command("night-log")
+def night_log(
+    context: CommandContext,
+    system: Annotated[
+        str, typer.Argument(help="Name of the system; by default that of the newest log.")
+    ] = "",
+    night: Annotated[
+        str, typer.Option("--night", help="Date of the evening, YYYY-MM-DD; by default the newest.")
+    ] = "",
+    runs: Annotated[
+        Path | None, typer.Option("--runs", help="Folder of the runs; by default the one of your data.")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", help="File to write: .html, or .md with figures beside it.")
+    ] = None,
+) -> None:
+    """Show the log of a night, or write it as Markdown or HTML with figures."""
+    from escape_hw.io.run_folder import default_runs_folder
+    from escape_hw.report.night_log import NightReport
+
+    report = NightReport.read(runs or default_runs_folder(), system, night)
+    files = () if out is None else report.write(out)
+    if out is None:
+        context.show(report.title, *(f"{name}: {value}" for name, value in report.summary().items()))
+        context.show(*(f"{time} {text}" for time, text in report.lines))
+    else:
+        context.show(*(f"written: {path}" for path in files))
+    context.set_subject(report.system, report.simulated, None)
+    context.report(
+        night=report.night, files=list(files),
+        entries=[entry.model_dump(mode="json", exclude_defaults=True) for entry in report.entries],
+    )  # fmt: skip

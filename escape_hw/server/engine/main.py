@@ -20,7 +20,7 @@ from escape_hw.server.engine.publisher import StreamPublisher, TelemetryRecordin
 from escape_hw.server.engine.request_handler import RequestHandler
 from escape_hw.server.engine.runner import LoopRunner, ProcedureRunner
 from escape_hw.server.engine.state import EngineState, LoopParameters
-from escape_hw.server.engine.state_publisher import StatePublisher
+from escape_hw.server.engine.state_publisher import StatePublisher, describe_recording
 from escape_hw.server.ipc.channel import Channel, EngineSetup
 from escape_hw.server.ipc.log import forward_log
 from escape_hw.server.safety.failsafe import CLEAN_EXIT
@@ -41,7 +41,9 @@ class Engine:
         state = self._state = EngineState(LoopParameters.from_config(config), first_run_id)
         publisher = self._publisher = StreamPublisher(config.system.name)
         store = ProductStore((setup.runs, *setup.read_folders))
-        recording = self._recording = TelemetryRecording(setup.runs, publisher)
+        recording = self._recording = TelemetryRecording(
+            setup.runs, publisher, lambda: describe_recording(bench, state.snapshot, store)
+        )
         state_publisher = self._state_publisher = StatePublisher(
             bench, state, publisher, store, setup.runs, self._send_state, recording.state
         )

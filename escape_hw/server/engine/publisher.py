@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,9 @@ from escape_hw.io.run_folder import dated_folder
 from escape_hw.io.storage import check_writable, make_folder
 from escape_hw.remote.source import STREAMS
 from escape_hw.remote.state import RecordingState, StreamEntry
+from escape_hw.runtime.session.recordings import RecordingDescription, write_description
 from escape_hw.streams.recording.process import RecorderProcess
+from escape_hw.streams.recording.recorder import RecordingProgress
 from escape_hw.streams.ring import SLOTS, RingWriter
 from escape_hw.streams.segments import segment_name
 
@@ -153,57 +155,75 @@ class StreamPublisher:
             ring.write(data, index, exposed_ns, time.monotonic_ns(), meta)
 
 
-#: The streams with an entry for every frame.
+#: The streams with an entry for every frame, and those of them with images.
 _RECORDED_STREAMS = ("frames", "slopes", "residual_modes", "commands", "psf")
+_IMAGE_STREAMS = ("frames", "psf")
 
 
 class TelemetryRecording:
-    """Records the streams at full rate, in a process that the loop does not wait for."""
+    """Records the streams at full rate, in a process that the loop does not wait for.
 
-    def __init__(self, runs: Path, publisher: StreamPublisher) -> None:
-        self._runs, self._publisher = runs, publisher
+    ``describe`` returns what an analysis of a recording needs to know about bench and loop.
+    """
+
+    def __init__(
+        self, runs: Path, publisher: StreamPublisher, describe: Callable[[], RecordingDescription]
+    ) -> None:
+        self._runs, self._publisher, self._describe = runs, publisher, describe
         self._process: RecorderProcess | None = None
         self._last = RecordingState()
 
-    def set_recording(self, on: bool) -> RecordingState:
+    def set_recording(self, on: bool, *, images: bool = True, seconds: float | None = None) -> RecordingState:
         """Start or stop; does nothing when the recording is in that state already.
 
         RequestRefused when there is no stream yet; StorageError when folder or process are not available.
         """
         if on and self._process is None:
-            self._start()
+            self._start(images, seconds)
         elif not on and self._process is not None:
-            process = self._process
-            self._last = self.state().model_copy(update={"recording": False})
-            self._process = None
-            end = process.stop()
-            self._last = RecordingState(path=str(process.folder), written=end.written, dropped=end.dropped)
-            log.info("recorded %d entries in %s, %d dropped", end.written, process.folder, end.dropped)
+            self._finish(self._process)
         return self.state()
 
-    def _start(self) -> None:
-        segments = {one.name: one.segment for one in self._publisher.entries if one.name in _RECORDED_STREAMS}
+    def _start(self, images: bool, seconds: float | None) -> None:
+        chosen = [name for name in _RECORDED_STREAMS if images or name not in _IMAGE_STREAMS]
+        segments = {one.name: one.segment for one in self._publisher.entries if one.name in chosen}
         if not segments:
             raise RequestRefused("there is nothing to record yet; wait for the first frame")
         folder = dated_folder(self._runs, "telemetry")
         make_folder(folder)
         check_writable(folder)
-        self._process = RecorderProcess(folder, segments)
+        description = self._describe()
+        write_description(folder, description)
+        self._last = RecordingState(path=str(folder), started_utc=description.started_utc)
+        self._process = RecorderProcess(folder, segments, seconds=seconds)
         log.info("recording %s in %s", ", ".join(segments), folder)
+
+    def _finish(self, process: RecorderProcess) -> None:
+        """Wait until everything is on disk; the state is that of the end."""
+        self._process = None
+        end = process.stop()
+        self._last = self._progress(end).model_copy(update={"recording": False})
+        log.info("recorded %d entries in %s, %d dropped", end.written, process.folder, end.dropped)
+
+    def _progress(self, now: RecordingProgress) -> RecordingState:
+        return self._last.model_copy(
+            update={
+                "recording": True, "written": now.written, "dropped": now.dropped, "size": now.size,
+                "fault": now.fault,
+            }
+        )  # fmt: skip
 
     def state(self) -> RecordingState:
         """Progress of the recording, or how the last one ended."""
         process = self._process
         if process is None:
             return self._last
-        now = process.state
-        state = RecordingState(
-            recording=True, path=str(process.folder), written=now.written, dropped=now.dropped
-        )
-        if now.fault or not process.running:
-            fault = now.fault or "the recorder process ended"
+        if process.running and not process.state.fault:
+            return self._progress(process.state)
+        is_complete = process.seconds is not None and not process.state.fault
+        self._finish(process)
+        if not is_complete:
+            fault = self._last.fault or "the recorder process ended"
             log.error("recording ended: %s", fault)
-            self._process = None
-            process.stop()
-            self._last = state = state.model_copy(update={"recording": False, "fault": fault})
-        return state
+            self._last = self._last.model_copy(update={"fault": fault})
+        return self._last

@@ -104,7 +104,9 @@ class RequestHandler:
             case requests.LoadProduct():
                 return self._product_store.load(request.path, request.name).model_dump(mode="json")
             case requests.SetRecording():
-                return self._recording.set_recording(request.on).model_dump(mode="json")
+                return self._recording.set_recording(
+                    request.on, images=request.images, seconds=request.seconds
+                ).model_dump(mode="json")
             case _:
                 raise RequestRefused(f"the engine has no request '{request.verb}'")
         return None

@@ -33,6 +33,7 @@ from escape_hw.remote.state import (
     State,
 )
 from escape_hw.runtime.session.record import actuator_layout, actuator_positions
+from escape_hw.runtime.session.recordings import RecordingDescription
 from escape_hw.server.engine.product_store import ProductStore
 from escape_hw.server.engine.publisher import StreamPublisher
 from escape_hw.server.engine.state import EngineSnapshot, EngineState
@@ -227,3 +228,16 @@ def geometry_of(bench: Bench, grid: SensorGeometry | None) -> Geometry:
         outlines_px=() if grid is None else grid.outlines(),
         n_modes=bench.config.basis.n_modes,
     )
+
+
+def describe_recording(bench: Bench, engine: EngineSnapshot, store: ProductStore) -> RecordingDescription:
+    """What an analysis of a recording needs to know about bench and loop."""
+    loop = engine.loop
+    known = {one.name: one.path for one in store.products}
+    return RecordingDescription(
+        system=bench.config.system.name, simulated=bench.simulated, started_utc=format_utc(),
+        rate_hz=float(bench.wfs.settings.frame_rate_hz) if bench.wfs.is_open else 0.0,
+        gain=loop.gain, leak=loop.leak, dropped_modes=loop.dropped_modes,
+        matrix=known.get(loop.matrix, ""), loop_closed=engine.loop_closed,
+        stroke_m=bench.config.devices.dm.stroke_m, max_stroke=bench.dm.limits.max_stroke,
+    )  # fmt: skip

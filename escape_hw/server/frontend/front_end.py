@@ -24,6 +24,7 @@ from escape_hw.remote.source import RENAMED_STREAMS, STREAMS
 from escape_hw.remote.state import SCHEMA, FinishedRun, LogLine, Phase, State
 from escape_hw.server.frontend.engine_supervisor import EngineSupervisor, PublishedState
 from escape_hw.server.frontend.lease import LeaseManager
+from escape_hw.server.frontend.night_log import NightLog
 from escape_hw.server.frontend.transport import IncomingRequest, ZmqTransport
 from escape_hw.server.ipc.channel import EngineSetup
 from escape_hw.server.ipc.log import ServerLog
@@ -68,6 +69,8 @@ class FrontEnd:
             notes=self._journal.read_previous_end(), unattended_limit_s=config.server.unattended_s,
         )  # fmt: skip
         self._published = PublishedState(state, self._leases, transport)
+        self._night_log = NightLog(config, runs, lambda entry: transport.publish("night", entry))
+        self._night_log.start(state.notes)
         #: Requests that the engine has not answered yet, and when they were forwarded (monotonic seconds).
         self._pending: dict[int, tuple[IncomingRequest, float]] = {}
         self._numbers = itertools.count(1)
@@ -101,6 +104,7 @@ class FrontEnd:
                 for incoming in self._transport.receive_requests():
                     self._handle_request(incoming)
                 self._leases.expire()
+                self._night_log.update(self._published.state)
                 supervisor.check(self._oldest_safety_request_s())
                 self._check_abandoned_run()
                 if stop.is_set():
@@ -114,6 +118,7 @@ class FrontEnd:
         self._transport.publish(
             "state", state.model_copy(update={"phase": Phase.STOPPED, "serial": state.serial + 1})
         )
+        self._night_log.close(clean)
         if clean:
             self._journal.close()
         self._readers.close()
@@ -161,7 +166,10 @@ class FrontEnd:
             case {"progress": progress}:
                 self._transport.publish("progress", progress)
             case {"ended": ended}:
-                self._transport.publish("ended", FinishedRun.model_validate(ended))
+                finished = FinishedRun.model_validate(ended)
+                self._transport.publish("ended", finished)
+                self._night_log.update(self._published.state)
+                self._night_log.log_run(finished)
 
     def _refuse_pending(self) -> None:
         for incoming, _ in self._pending.values():
@@ -187,6 +195,12 @@ class FrontEnd:
                 case requests.GetLog():
                     lines = self._log.after(request.after, request.count)
                     self._transport.send_reply(route, [line.model_dump(mode="json") for line in lines])
+                case requests.GetNightLog():
+                    entries = self._night_log.after(request.after, request.count)
+                    self._transport.send_reply(route, [entry.model_dump(mode="json") for entry in entries])
+                case requests.AddNote():
+                    author = self._leases.describe_sender(request.client, route.sender)
+                    self._transport.send_reply(route, self._night_log.add(request.kind, request.text, author))
                 case requests.AcquireLease():
                     lease = self._leases.acquire(client, request.take_over)
                     self._published.update()

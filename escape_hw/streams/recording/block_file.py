@@ -6,6 +6,7 @@ one of the data, both in NumPy's file format. A truncated file is readable up to
 
 from __future__ import annotations
 
+import contextlib
 import io
 import os
 from dataclasses import dataclass
@@ -102,6 +103,62 @@ def read_recording(path: Path) -> list[Recording]:
     except OSError as error:
         raise ProductError(f"{path}: cannot be read ({error.strerror or error})") from error
     return [_concatenate(part, complete) for part in _group_by_shape(blocks)]
+
+
+def count_entries(path: Path) -> int:
+    """Number of entries in the complete blocks of a recorded stream; 0 if it cannot be read."""
+    return sum(n for _, n in _scan_blocks(path))
+
+
+def read_newest(path: Path, count: int) -> Recording | None:
+    """The newest entries of a recorded stream, also of one that is being written; ``None`` if there are none.
+
+    At most ``count`` entries, of one shape. Other blocks are skipped, not read.
+
+    Raises
+    ------
+    ProductError
+        The file does not exist or is not a recording.
+    """
+    blocks = _scan_blocks(path)
+    first, entries = len(blocks), 0
+    while first and entries < count:
+        first -= 1
+        entries += blocks[first][1]
+    read = []
+    try:
+        with open(path, "rb") as file:
+            for offset, _ in blocks[first:]:
+                file.seek(offset)
+                head = np.lib.format.read_array(file, allow_pickle=False)
+                read.append((head, np.lib.format.read_array(file, allow_pickle=False)))
+    except (OSError, ValueError) as error:
+        raise ProductError(f"{path}: cannot be read ({error})") from error
+    if not read:
+        return None
+    newest = _concatenate(_group_by_shape(read)[-1], complete=True)
+    part = slice(-count, None)
+    return Recording(
+        newest.index[part], newest.exposed_ns[part], newest.arrived_ns[part], newest.data[part], True
+    )
+
+
+def _scan_blocks(path: Path) -> list[tuple[int, int]]:
+    """Offset and number of entries of every complete block."""
+    found = []
+    with contextlib.suppress(OSError, ValueError, EOFError), open(path, "rb") as file:
+        size = os.fstat(file.fileno()).st_size
+        while (offset := file.tell()) < size:
+            entries = 0
+            for _ in range(2):
+                np.lib.format.read_magic(file)
+                shape, _, dtype = np.lib.format.read_array_header_1_0(file)
+                file.seek(dtype.itemsize * int(np.prod(shape)), os.SEEK_CUR)
+                entries = shape[0]
+            if file.tell() > size:
+                break
+            found.append((offset, entries))
+    return found
 
 
 def _group_by_shape(

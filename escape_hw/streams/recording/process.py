@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 import logging
+import math
 import os
 import subprocess
 import sys
+import time
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -26,15 +28,23 @@ _NICE = 5
 class RecorderProcess:
     """A :class:`~escape_hw.streams.recording.recorder.StreamRecorder` in another process.
 
-    Raises ``StorageError`` if the process cannot be started.
+    It ends by itself after ``seconds``, if given. Raises ``StorageError`` if the process cannot be started.
     """
 
     def __init__(
-        self, folder: Path, streams: Mapping[str, str], *, min_free_bytes: int = MIN_FREE_BYTES
+        self,
+        folder: Path,
+        streams: Mapping[str, str],
+        *,
+        seconds: float | None = None,
+        min_free_bytes: int = MIN_FREE_BYTES,
     ) -> None:
-        self.folder = folder
+        self.folder, self.seconds = folder, seconds
         self._state = RecordingProgress()
-        request = {"folder": str(folder), "streams": dict(streams), "min_free_bytes": min_free_bytes}
+        request = {
+            "folder": str(folder), "streams": dict(streams), "min_free_bytes": min_free_bytes,
+            "seconds": seconds,
+        }  # fmt: skip
         try:
             self._process = ChildProcess(
                 __name__, json.dumps(request), stdin=subprocess.PIPE, stdout=subprocess.PIPE
@@ -90,7 +100,8 @@ def main() -> None:
     recorder = StreamRecorder(
         Path(request["folder"]), request["streams"], min_free_bytes=request["min_free_bytes"]
     )
-    recorder.run(stop.is_set, print_state)
+    end_s = math.inf if request["seconds"] is None else time.monotonic() + request["seconds"]
+    recorder.run(lambda: stop.is_set() or time.monotonic() > end_s, print_state)
 
 
 if __name__ == "__main__":
