@@ -15,7 +15,7 @@ from escape_hw.pipeline.psf.strehl import find_peak, has_light, subtract_backgro
 #: Directions in which the half maximum is searched, and step along each of them in pixels.
 _DIRECTIONS, _STEP_PX = 72, 0.05
 #: Parts into which a pixel is divided, along each axis, to find its share within a circle.
-_SUBPIXELS = 3
+_SUBPIXELS = 4
 
 
 @dataclass(frozen=True, slots=True)
