@@ -23,11 +23,16 @@ from escape_gui.widgets.images import (
     Quiver,
     outline_points,
 )
-from escape_gui.widgets.plots import Plot
+from escape_gui.widgets.plots import Plot, SectionPlot
 from escape_hw.remote.source import Sample
 from escape_hw.remote.state import State
 
 RAW, ARROWS, MAPS, DIFFERENCE = "raw", "arrows", "x | y", "difference"
+HISTOGRAM, SECTION = "histogram", "section"
+_PLOT_TIPS = (
+    "Number of pixels by brightness",
+    "Row and column through the pixel that was clicked, at first the brightest; a double click returns to it",
+)
 _TIPS = (
     "Raw frame", "Slopes as arrows over the frame", "Slopes in x and y as maps", "Frame minus the reference",
 )  # fmt: skip
@@ -73,16 +78,22 @@ class CameraPanel(Panel):
         self.image_view.box.addItem(self._outlines)
         self.bars = (
             ImageToolbar(theme, self.image_view),
-            ImageToolbar(theme, self.signed, logarithmic=False),
+            ImageToolbar(theme, self.signed),
         )
+        self.plot_choice = SegmentedButton("Plot of the frame", (HISTOGRAM, SECTION), _PLOT_TIPS)
+        self.plot_choice.chosen.connect(self._on_view_changed)
+        self.section = SectionPlot(theme, "counts")
+        self.image_view.pixel_clicked.connect(self._on_pixel_clicked)
+        self.image_view.view.double_clicked.connect(lambda: self._on_pixel_clicked(-1, -1))
         self.histogram = Plot(theme, "Histogram of the frame", "counts", "pixels")
         self.histogram.setLogMode(x=False, y=True)
         self._curve = self.histogram.curve(0, alone=True, stepMode="center")
-        self.body.addLayout(row(self.choice, None))
+        self.body.addLayout(row(self.choice, None, self.plot_choice))
         for widget in (self.saturation, self.image_view, self.signed):
             self.body.addWidget(widget)
         self.body.addLayout(row(self.set_reference_button, *((bar, 1) for bar in self.bars)))
         self.body.addWidget(self.histogram)
+        self.body.addWidget(self.section)
         self.body.setStretchFactor(self.image_view, 1)
         self.body.setStretchFactor(self.signed, 1)
         self._frame: NDArray[Any] | None = None
@@ -130,7 +141,21 @@ class CameraPanel(Panel):
         if now >= self._histogram_due:
             self._histogram_due = now + _HISTOGRAM_PERIOD_S
             self.image_view.mark_pixels(None if self._full_scale is None else frame >= self._full_scale)
+            self._show_plot(frame)
+
+    def _show_plot(self, frame: NDArray[Any]) -> None:
+        if self.plot_choice.selected == SECTION:
+            shown = frame if self.image_view.data is None else self.image_view.data
+            self.image_view.mark_section(self.section.show_image(shown))
+        else:
+            self.image_view.mark_section(None)
             self._show_histogram(frame)
+
+    def _on_pixel_clicked(self, x: int, y: int) -> None:
+        """Put the section through a pixel; -1: through the brightest."""
+        self.section.place = (x, y) if x >= 0 else None
+        self._histogram_due = 0.0
+        self._show_frame()
 
     def _show_histogram(self, frame: NDArray[Any]) -> None:
         step = max(1, int(np.sqrt(frame.size / _MAX_SAMPLED_PIXELS)))
@@ -161,11 +186,16 @@ class CameraPanel(Panel):
             widget.setVisible(signed)
         self.quiver.setVisible(self.choice.selected == ARROWS)
         high = self.height() >= self.context.theme.pixels(_MIN_HEIGHT_FOR_HISTOGRAM)
-        self.histogram.setVisible(high and not signed)
+        plotted = self.plot_choice.selected
+        self.histogram.setVisible(high and not signed and plotted == HISTOGRAM)
+        self.section.setVisible(high and not signed and plotted == SECTION)
+        self.plot_choice.setVisible(high and not signed)
 
-    def _on_view_changed(self, view: str) -> None:
+    def _on_view_changed(self, _: str) -> None:
+        view = self.choice.selected
         self._update_visibility()
         self.signed.clear()
+        self._histogram_due = 0.0
         if view == DIFFERENCE and self._reference is None:
             self._set_reference()
         self._show_frame()
@@ -176,7 +206,7 @@ class CameraPanel(Panel):
             self._reference = self._frame.astype(np.float32)
 
     def clear(self) -> None:
-        self._frame = self._reference = self._slopes = None
+        self._frame = self._reference = self._slopes = self.section.place = None
         self.image_view.clear()
         self.signed.clear()
 
@@ -184,6 +214,7 @@ class CameraPanel(Panel):
         theme = self.context.theme
         self.saturation.setFont(theme.font(0.9, mono=True))
         self.histogram.setFixedHeight(theme.pixels(92))
+        self.section.setFixedHeight(theme.pixels(120))
         colour = theme.series(1)
         colour.setAlpha(90)
         self._outlines.setPen(pg.mkPen(colour, width=1))

@@ -53,7 +53,7 @@ class MirrorPanel(Panel):
         }
         self.body.addLayout(row(self.choice, None, self.scale))
         self.body.addWidget(self.image_view, 1)
-        self.body.addWidget(ImageToolbar(theme, self.image_view, logarithmic=False))
+        self.body.addWidget(ImageToolbar(theme, self.image_view))
         self.body.addLayout(readout_grid(self.readouts))
         self._values: dict[str, NDArray[Any]] = {}
         self._map = ActuatorImage(self.bench_geometry)

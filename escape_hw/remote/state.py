@@ -330,6 +330,9 @@ class Geometry(StateDocument):
     #: Sub-aperture or pupil outlines on the camera: (x, y, half width) in pixels each.
     outlines_px: tuple[tuple[float, float, float], ...] = ()
     n_modes: int = 0
+    #: Metres of surface for a command of 1, and lambda/D in pixels of the science camera; 0 if unknown.
+    stroke_m: float = 0.0
+    psf_px: float = 0.0
 
 
 #: Arguments of a procedure by name.

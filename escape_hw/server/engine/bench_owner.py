@@ -117,7 +117,8 @@ class BenchOwner:
         bench = self.bench
         try:
             bench.open()
-            self.publisher.set_full_scale(bench.wfs.info.full_scale)
+            science = None if bench.science is None else bench.science.info.full_scale
+            self.publisher.set_full_scale(bench.wfs.info.full_scale, science)
             bench.callbacks = self.publisher.callbacks
             bench.dm.flatten()
         except EscapeError as error:

@@ -220,10 +220,13 @@ def _facts(device: Device) -> dict[str, float | str]:
 def geometry_of(bench: Bench, grid: SensorGeometry | None) -> Geometry:
     """Positions of the sub-apertures and actuators."""
     valid = () if grid is None else tuple("".join("1" if one else "0" for one in row) for row in grid.valid)
+    stroke_m, science = float(bench.dm.info.stroke_m), bench.config.devices.science
     return Geometry(
         valid=valid,
         layout=actuator_layout(bench),
         positions_m=actuator_positions(bench),
         outlines_px=() if grid is None else grid.outlines(),
         n_modes=bench.config.basis.n_modes,
+        stroke_m=stroke_m if math.isfinite(stroke_m) else 0.0,
+        psf_px=0.0 if science is None else science.psf_px,
     )
