@@ -149,9 +149,47 @@ class SetRecording(Request):
     on: bool
 
 
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Pixel = Annotated[int, Field(ge=0, le=100_000)]
+
+
+class CameraRequest(Request):
+    """Settings of a camera; absent ones stay.
+
+    ``check_camera`` changes nothing. Both are answered with :class:`~escape_hw.remote.state.CameraPlan`.
+    """
+
+    verb: Literal["check_camera", "set_camera"]
+    camera: Literal["wfs", "science"]
+    exposure_s: Positive | None = None
+    frame_rate_hz: Positive | None = None
+    gain_db: Annotated[float, Field(allow_inf_nan=False)] | None = None
+    #: x, y, width, height.
+    region: tuple[Pixel, Pixel, Pixel, Pixel] | None = None
+
+
+#: Longest time for which a poke is held, seconds.
+LONGEST_POKE_S = 30.0
+
+
+class PokeRequest(Request):
+    """Poke one actuator or mode of an idle bench; the mirror returns to flat by itself.
+
+    ``check_poke`` moves nothing. It is answered with :class:`~escape_hw.remote.state.PokePlan`, ``poke`` with
+    ``null`` when the poke has begun.
+    """
+
+    verb: Literal["check_poke", "poke"]
+    kind: Literal["actuator", "mode"]
+    number: Annotated[int, Field(ge=0)]
+    #: Command of the actuator, or of the actuator that the mode moves most, as fraction of full stroke.
+    amplitude: Annotated[float, Field(ge=-1, le=1, allow_inf_nan=False)]
+    seconds: Annotated[float, Field(ge=0.1, le=LONGEST_POKE_S, allow_inf_nan=False)] = 2.0
+
+
 AnyRequest = Annotated[
     PlainRequest | RegisterClient | GetLog | GetLatestSample | AcquireLease | ProcedureRequest | CloseLoop
-    | SetLoop | LoadProduct | SetRecording,
+    | SetLoop | LoadProduct | SetRecording | CameraRequest | PokeRequest,
     Field(discriminator="verb"),
 ]  # fmt: skip
 
@@ -178,7 +216,7 @@ SAFETY_VERBS = frozenset({"open_loop", "flatten", "abort_procedure"})
 #: Requests that need the lease.
 LEASE_VERBS = frozenset({
     "start_procedure", "pause_procedure", "resume_procedure", "close_loop", "set_loop", "load_product",
-    "set_recording", "clear_fault", "shutdown",
+    "set_recording", "clear_fault", "shutdown", "set_camera", "poke",
 })  # fmt: skip
 #: Requests that change the state.
 STATE_CHANGING_VERBS = SAFETY_VERBS | LEASE_VERBS - {"shutdown"} | {"acquire_lease", "release_lease"}

@@ -335,6 +335,43 @@ class Geometry(StateDocument):
     psf_px: float = 0.0
 
 
+class CameraValues(StateDocument):
+    """Settings of a camera."""
+
+    exposure_s: float
+    frame_rate_hz: float
+    gain_db: float
+    #: x, y, width, height, pixels.
+    region: tuple[int, int, int, int]
+
+
+class CameraPlan(StateDocument):
+    """What other settings of a camera would change."""
+
+    camera: str
+    #: Settings in force, and the nearest to the requested ones that the camera can do.
+    current: CameraValues
+    planned: CameraValues
+    #: The differences in words, and what they discard.
+    changes: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+    #: Why they cannot be applied now; empty if they can.
+    refusal: str = ""
+
+
+class PokePlan(StateDocument):
+    """What a poke of one actuator or mode would do."""
+
+    description: str
+    #: Largest command of an actuator, as fraction of full stroke and in nanometres of surface; the latter is
+    #: 0 where the stroke is not known.
+    peak: float
+    peak_nm: float = 0.0
+    #: Largest amplitude that the limits of the mirror allow, and why the poke is not possible now.
+    allowed: float
+    refusal: str = ""
+
+
 #: Arguments of a procedure by name.
 Arguments = dict[str, Annotated[float, Field(allow_inf_nan=False)] | int | bool | str | None]
 

@@ -47,9 +47,7 @@ class Engine:
         )
         owner = self._owner = BenchOwner(bench, state, publisher, state_publisher, channel.post)
         loop_runner = LoopRunner(owner, store)
-        procedure_runner = ProcedureRunner(
-            owner, loop_runner, store, config_text=setup.config_text, runs=setup.runs
-        )
+        procedure_runner = ProcedureRunner(owner, loop_runner, store, runs=setup.runs)
         self._request_handler = RequestHandler(
             owner, loop_runner, procedure_runner, store, recording, self.request_stop
         )

@@ -81,8 +81,14 @@ class StreamPublisher:
             for name, ring in tuple(self._rings.items())
         )
 
-    def set_geometry(self, grid: SensorGeometry) -> None:
-        """Store the sensor's geometry."""
+    def remove_stream(self, name: str) -> None:
+        """Remove a stream whose content is no longer valid."""
+        ring = self._rings.pop(name, None)
+        if ring is not None:
+            ring.close()
+
+    def set_geometry(self, grid: SensorGeometry | None) -> None:
+        """Store the sensor's geometry; ``None`` when it is no longer valid."""
         if grid is not self.grid:
             self.grid = grid
             self.geometry_version += 1
