@@ -8,13 +8,14 @@ from typing import Any, ClassVar
 import numpy as np
 import pyqtgraph as pg
 from numpy.typing import NDArray
+from PySide6.QtCore import Signal
 from PySide6.QtGui import QResizeEvent
 from PySide6.QtWidgets import QLabel, QToolButton
 
 from escape_gui.client.availability import UNKNOWN_VALUE, has_frames
 from escape_gui.panels.base import Context, ExportArray, Panel
 from escape_gui.views.images import mask_from_rows, slope_map_pair
-from escape_gui.widgets.controls import SegmentedButton, row
+from escape_gui.widgets.controls import SegmentedButton, flat_button, row
 from escape_gui.widgets.images import (
     DIVERGING_MAPS,
     SEQUENTIAL_MAPS,
@@ -59,6 +60,9 @@ class CameraPanel(Panel):
         "No frames yet.\nThey are shown once a server has opened the sensor's camera."
     )
 
+    #: Name of the camera whose settings are to be shown.
+    settings_requested = Signal(str)
+
     def __init__(self, context: Context) -> None:
         super().__init__(context)
         theme = context.theme
@@ -91,7 +95,13 @@ class CameraPanel(Panel):
         self.body.addLayout(row(self.choice, None, self.plot_choice))
         for widget in (self.saturation, self.image_view, self.signed):
             self.body.addWidget(widget)
-        self.body.addLayout(row(self.set_reference_button, *((bar, 1) for bar in self.bars)))
+        self.settings_button = flat_button(
+            "Settings…", "Exposure, gain, region, dark and flat of this camera"
+        )
+        self.settings_button.clicked.connect(lambda: self.settings_requested.emit("wfs"))
+        self.body.addLayout(
+            row(self.set_reference_button, self.settings_button, *((bar, 1) for bar in self.bars))
+        )
         self.body.addWidget(self.histogram)
         self.body.addWidget(self.section)
         self.body.setStretchFactor(self.image_view, 1)

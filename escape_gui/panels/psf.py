@@ -7,11 +7,12 @@ from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
+from PySide6.QtCore import Signal
 from PySide6.QtWidgets import QHBoxLayout, QLabel
 
 from escape_gui.panels.base import Context, ExportArray, Panel
 from escape_gui.views.images import RadialProfile
-from escape_gui.widgets.controls import SegmentedButton, caption, column, row
+from escape_gui.widgets.controls import SegmentedButton, caption, column, flat_button, row
 from escape_gui.widgets.images import ImageToolbar, ImageViewer
 from escape_gui.widgets.plots import Plot, SectionPlot
 from escape_hw.errors import CalibrationError
@@ -52,6 +53,9 @@ class PsfPanel(Panel):
         "No image yet.\nThe science camera, if there is one, is read while the loop is closed."
     )
 
+    #: Name of the camera whose settings are to be shown.
+    settings_requested = Signal(str)
+
     def __init__(self, context: Context) -> None:
         super().__init__(context)
         theme = context.theme
@@ -79,7 +83,9 @@ class PsfPanel(Panel):
         self._shape_due = 0.0
         self._make_plots()
         self.body.addLayout(pair, 3)
-        self.body.addLayout(row(self.choice, (self.toolbar, 1)))
+        self.settings_button = flat_button("Settings…", "Exposure, gain and region of the science camera")
+        self.settings_button.clicked.connect(lambda: self.settings_requested.emit("science"))
+        self.body.addLayout(row(self.choice, self.settings_button, (self.toolbar, 1)))
         for plot in self.plots.values():
             self.body.addWidget(plot, 2)
         self.body.addWidget(self.shape_text)
@@ -153,6 +159,10 @@ class PsfPanel(Panel):
                 clean = subtract_background(view.data)
                 peak = np.unravel_index(int(np.argmax(clean)), clean.shape)
                 self._energy_curves[key].setData(*encircled_energy(clean, (float(peak[0]), float(peak[1]))))
+
+    def on_geometry(self) -> None:
+        self._shape_due = 0.0
+        self._measure_shape()
 
     def on_sample(self, stream: str, sample: Sample) -> None:
         self._images[stream] = sample.data

@@ -72,6 +72,8 @@ class ImageViewer(QWidget):
         super().__init__()
         self._theme, self._maps, self._symmetric = theme, tuple(maps), symmetric
         self.unit, self._min_level = unit, min_level
+        #: A second unit for the value under the cursor: factor and name.
+        self.second_unit: tuple[float, str] | None = None
         #: The array shown: the mean of several if :attr:`average` is set so.
         self.data: NDArray[Any] | None = None
         self.average = FrameAverage()
@@ -253,7 +255,10 @@ class ImageViewer(QWidget):
         self._cursor = (x, y)
         value = data[y, x]
         text = f"{value:d}" if np.issubdtype(data.dtype, np.integer) else f"{value:.4g}"
-        self.cursor_changed.emit(f"x {x:4d}  y {y:4d}  {text:>8} {self.unit}".rstrip())
+        second = (
+            "" if self.second_unit is None else f" = {self.second_unit[0] * value:.4g} {self.second_unit[1]}"
+        )
+        self.cursor_changed.emit(f"x {x:4d}  y {y:4d}  {text:>8} {self.unit}".rstrip() + second)
 
     def keyPressEvent(self, event: QKeyEvent) -> None:
         """Keys of :data:`escape_gui.window.actions.IMAGE_KEYS`."""

@@ -13,6 +13,8 @@ from escape_hw.errors import EscapeError
 from escape_hw.remote.source import Sample
 from escape_hw.remote.state import (
     Arguments,
+    CameraPlan,
+    CameraValues,
     DeviceHealth,
     DeviceState,
     DiskState,
@@ -26,6 +28,7 @@ from escape_hw.remote.state import (
     LoopState,
     MirrorState,
     Phase,
+    PokePlan,
     ProcedureEntry,
     ProcedurePlan,
     ProductEntry,
@@ -83,7 +86,14 @@ def shack_hartmann(n: int = 24, pitch: float = 15.54) -> Geometry:
     half = 0.5 * pitch
     places = [(14 + (c + 0.5) * pitch, 14 + (r + 0.5) * pitch) for r, c in zip(rows, columns, strict=True)]
     outlines = tuple((x, y, half) for x, y in places)
-    return Geometry(valid=rows_of(valid), layout=rows_of(disc(11, 1.03)), outlines_px=outlines, n_modes=94)
+    return Geometry(
+        valid=rows_of(valid),
+        layout=rows_of(disc(11, 1.03)),
+        outlines_px=outlines,
+        n_modes=94,
+        stroke_m=3.5e-6,
+        psf_px=2.46,
+    )
 
 
 def secondary() -> Geometry:
@@ -265,6 +275,35 @@ class ScriptedControl:
         if verb.startswith("_"):
             raise AttributeError(verb)
         return lambda *args, **kwargs: self._note(verb, **({"args": args} if args else {}), **kwargs)
+
+    #: Settings of both cameras.
+    camera = CameraValues(exposure_s=1.9e-3, frame_rate_hz=500.0, gain_db=0.0, region=(0, 0, 400, 400))
+    #: Why the camera cannot be changed, and the mirror not be poked.
+    refusal = ""
+
+    def check_camera(self, camera: str, **settings: Any) -> CameraPlan:
+        """What the settings would change."""
+        self._note("check_camera", camera=camera, **settings)
+        planned = self.camera.model_copy(update=settings)
+        changes = tuple(f"{name} → {value}" for name, value in settings.items())
+        return CameraPlan(
+            camera=camera, current=self.camera, planned=planned, changes=changes, refusal=self.refusal
+        )
+
+    def set_camera(self, camera: str, **settings: Any) -> CameraPlan:
+        """Change the settings."""
+        plan = self.check_camera(camera, **settings)
+        self.asked[-1] = ("set_camera", self.asked[-1][1])
+        self.camera = plan.planned
+        return plan
+
+    def check_poke(self, kind: str, number: int, amplitude: float, seconds: float) -> PokePlan:
+        """What a poke would do."""
+        self._note("check_poke", kind=kind, number=number, amplitude=amplitude, seconds=seconds)
+        return PokePlan(
+            description=f"{kind} {number + 1} at {amplitude:+g}", peak=abs(amplitude), peak_nm=150.0,
+            allowed=0.4, refusal=self.refusal,
+        )  # fmt: skip
 
     def plan(self, procedure: str, arguments: Arguments) -> ProcedurePlan:
         """A plan."""

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from serving import Served, serving, until_idle, wait_for
 
-from escape_hw.errors import ConfigError, RequestRefused, SettingRejected
+from escape_hw.errors import CalibrationError, ConfigError, RequestRefused, SettingRejected
 from escape_hw.remote.client import Connection
 from escape_hw.remote.state import Phase
 
@@ -141,3 +141,23 @@ def test_pokes_beyond_the_mirror_are_refused(bench: Connection) -> None:
     assert "allow at most" in plan.refusal
     with pytest.raises(RequestRefused, match="allow at most"):
         bench.poke("actuator", 0, 1.0)
+
+
+def test_a_dark_frame_is_measured_with_the_beam_stop_and_a_flat_needs_uniform_light(
+    bench: Connection,
+) -> None:
+    run = bench.start("dark", frames=20)
+    run.wait(60)
+    assert (Path(run.ended.folder) / "dark.fits").is_file()
+    assert 0 < run.ended.document["mean"] < 100
+    facts = {one.name: one.facts for one in bench.state.devices}["wfs"]
+    assert (facts["dark"], facts["flat"]) == ("measured", "none")
+    # The spots of lenslets are no uniform light.
+    with pytest.raises(CalibrationError, match="uniform light"):
+        bench.start("flat", frames=20).wait(60)
+    exposure = bench.check_camera("wfs").current.exposure_s
+    plan = bench.set_camera("wfs", exposure_s=0.8 * exposure)
+    assert plan.warnings == ("the dark frame is discarded: measure it again",)
+    facts = {one.name: one.facts for one in bench.state.devices}["wfs"]
+    assert facts["dark"] == "none"
+    bench.set_camera("wfs", exposure_s=exposure)

@@ -176,8 +176,12 @@ def _finite_metric(metrics: Mapping[str, float], name: str) -> float | None:
 
 def device_states(bench: Bench, device_messages: Mapping[str, str]) -> tuple[DeviceState, ...]:
     """State of every device; ``device_messages`` holds their problems by name."""
+    used = {
+        name: "none" if image is None else "measured"
+        for name, image in (("dark", bench.dark), ("flat", bench.flat))
+    }
     return tuple(
-        _device(name, kind, getattr(bench, name), device_messages)
+        _device(name, kind, getattr(bench, name), device_messages, used if name == "wfs" else {})
         for name, kind in (
             ("dm", "deformable mirror"),
             ("wfs", "wavefront sensor camera"),
@@ -189,7 +193,9 @@ def device_states(bench: Bench, device_messages: Mapping[str, str]) -> tuple[Dev
     )
 
 
-def _device(name: str, kind: str, device: Device, device_messages: Mapping[str, str]) -> DeviceState:
+def _device(
+    name: str, kind: str, device: Device, device_messages: Mapping[str, str], facts: Mapping[str, str]
+) -> DeviceState:
     message = device_messages.get(name, "")
     if not device.is_open:
         health = DeviceHealth.LOST if message else DeviceHealth.CLOSED
@@ -199,7 +205,8 @@ def _device(name: str, kind: str, device: Device, device_messages: Mapping[str, 
     info = device.info  # type: ignore[attr-defined]
     return DeviceState(
         name=name, kind=kind, model=info.model, serial=info.serial, simulated=bool(info.simulated),
-        health=DeviceHealth.STALE if message else DeviceHealth.OK, facts=_facts(device), message=message,
+        health=DeviceHealth.STALE if message else DeviceHealth.OK, facts={**_facts(device), **facts},
+        message=message,
     )  # fmt: skip
 
 
