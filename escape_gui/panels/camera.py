@@ -70,7 +70,7 @@ class CameraPanel(Panel):
         self.choice.chosen.connect(self._on_view_changed)
         self.set_reference_button = QToolButton()
         self.set_reference_button.setText("Set reference")
-        self.set_reference_button.setToolTip("Use this frame as reference for 'difference'")
+        self.set_reference_button.setToolTip("Use the present frame as reference")
         self.set_reference_button.clicked.connect(self._set_reference)
         self.saturation = QLabel()
         self.image_view = ImageViewer(theme, "Frame of the sensor", SEQUENTIAL_MAPS, unit="counts")
@@ -92,7 +92,7 @@ class CameraPanel(Panel):
         self.histogram = Plot(theme, "Histogram of the frame", "counts", "pixels")
         self.histogram.setLogMode(x=False, y=True)
         self._curve = self.histogram.curve(0, alone=True, stepMode="center")
-        self.body.addLayout(row(self.choice, None, self.plot_choice))
+        self.body.addLayout(row(self.choice, None))
         for widget in (self.saturation, self.image_view, self.signed):
             self.body.addWidget(widget)
         self.settings_button = flat_button(
@@ -102,6 +102,7 @@ class CameraPanel(Panel):
         self.body.addLayout(
             row(self.set_reference_button, self.settings_button, *((bar, 1) for bar in self.bars))
         )
+        self.body.addWidget(self.plot_choice)
         self.body.addWidget(self.histogram)
         self.body.addWidget(self.section)
         self.body.setStretchFactor(self.image_view, 1)
@@ -192,6 +193,7 @@ class CameraPanel(Panel):
         signed = self.choice.selected in (MAPS, DIFFERENCE)
         for widget in (self.image_view, self.bars[0]):
             widget.setVisible(not signed)
+        self.set_reference_button.setVisible(self.choice.selected == DIFFERENCE)
         for widget in (self.signed, self.bars[1]):
             widget.setVisible(signed)
         self.quiver.setVisible(self.choice.selected == ARROWS)

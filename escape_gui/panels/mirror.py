@@ -91,10 +91,14 @@ class MirrorPanel(Panel):
             "clipped": Readout(theme, "clipped", "%", 6),
         }
         self._nm_per_stroke, self._state = 0.0, State()
+        self.body.setSpacing(4)
         self.body.addLayout(row(self.choice, None, self.scale))
         self.body.addWidget(self.image_view, 1)
-        self.body.addWidget(ImageToolbar(theme, self.image_view))
-        self.body.addLayout(readout_grid(self.readouts))
+        self.arm_button = QPushButton("Arm pokes")
+        self.body.addLayout(row(self.arm_button, (ImageToolbar(theme, self.image_view), 1)))
+        self._numbers = QWidget()
+        self._numbers.setLayout(readout_grid(self.readouts))
+        self.body.addWidget(self._numbers)
         self._make_poke_controls()
         self._values: dict[str, NDArray[Any]] = {}
         self._map = ActuatorImage(self.bench_geometry)
@@ -105,7 +109,6 @@ class MirrorPanel(Panel):
     def _make_poke_controls(self) -> None:
         """The second step of a poke: choose, see the plan, hold the button."""
         theme = self.context.theme
-        self.arm_button = QPushButton("Arm pokes")
         self.arm_button.setCheckable(True)
         self.arm_button.toggled.connect(self._on_armed)
         self.poke_kind = SegmentedButton(
@@ -130,13 +133,14 @@ class MirrorPanel(Panel):
         self.poke_button = HoldButton("poke", theme)
         self.poke_button.confirmed.connect(self._poke)
         self._poke_row = QWidget()
-        numbers = row(
-            self.poke_kind, self.poke_number, (self.poke_amplitude, 1), (self.poke_seconds, 1), caption("s"),
+        what = row(self.poke_kind, (self.poke_number, 1), spacing=4)
+        amount = row(
+            (self.poke_amplitude, 1), caption("of the stroke, for"), (self.poke_seconds, 1), caption("s"),
             spacing=4,
         )  # fmt: skip
-        column(numbers, self.poke_text, self.poke_button, parent=self._poke_row, spacing=4)
+        last = row((self.poke_text, 1), self.poke_button)
+        column(what, amount, last, parent=self._poke_row, spacing=4)
         self._poke_row.hide()
-        self.body.addLayout(row(self.arm_button, None))
         self.body.addWidget(self._poke_row)
         self._spot = pg.ScatterPlotItem(symbol="o", size=16, brush=None)
         self._spot.setZValue(8)
@@ -147,6 +151,8 @@ class MirrorPanel(Panel):
 
     def _on_armed(self, armed: bool) -> None:
         self._poke_row.setVisible(armed)
+        # Room for the map, where actuators are clicked; rms and peak are in the header, too.
+        self._numbers.setHidden(armed)
         self.arm_button.setText("Disarm pokes" if armed else "Arm pokes")
         if not armed and self._is_held:
             self.context.session.abort()
@@ -281,13 +287,14 @@ class MirrorPanel(Panel):
             self.image_view.second_unit = (nm, "nm") if nm else None
         self.image_view.show_array(self._map.to_image(values))
         level, second = self.image_view.levels[1], self.image_view.second_unit
-        nm_text = "" if second is None else f" = ±{second[0] * level:.3g} nm"
+        nm_text = "" if second is None else f" = {second[0] * level:.0f} nm"
         self.scale.setText(f"±{level:.3g} {self.image_view.unit}{nm_text}")
 
     def _update_measured_button(self) -> None:
         button = self.choice.buttons[MEASURED]
         button.setEnabled(MEASURED in self._values)
         button.setVisible(MEASURED in self._values)
+        self.choice.setVisible(MEASURED in self._values)
 
     def clear(self) -> None:
         self._values.clear()

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 from PySide6.QtCore import Signal
-from PySide6.QtWidgets import QHBoxLayout, QLabel
+from PySide6.QtWidgets import QHBoxLayout, QLabel, QSizePolicy
 
 from escape_gui.panels.base import Context, ExportArray, Panel
 from escape_gui.views.images import RadialProfile
@@ -30,6 +30,8 @@ _TIPS = (
 )
 #: Period of the measurement of width and encircled energy, which takes about 20 ms.
 _SHAPE_PERIOD_S = 1.0
+#: Width of the panel from which the whole text is shown, pixels.
+_WIDE = 400
 CAPTIONS = {"psf": "PSF: measured (solid)", "model_psf": "PSF: reference (dashed)"}
 #: Caption and tooltip if there is no reference.
 NO_REFERENCE = "no reference PSF: run model-psf"
@@ -78,14 +80,18 @@ class PsfPanel(Panel):
         self.choice.chosen.connect(self._on_plot_chosen)
         #: Width and encircled energy of the measured image.
         self.shape_text = QLabel()
-        self.shape_text.setWordWrap(True)
+        for label in (self.shape_text, *self.captions.values()):
+            # The text must not widen the panel.
+            label.setSizePolicy(QSizePolicy.Policy.Ignored, QSizePolicy.Policy.Fixed)
         self.shape: PsfShape | None = None
         self._shape_due = 0.0
         self._make_plots()
+        self.body.setSpacing(4)
         self.body.addLayout(pair, 3)
         self.settings_button = flat_button("Settings…", "Exposure, gain and region of the science camera")
         self.settings_button.clicked.connect(lambda: self.settings_requested.emit("science"))
-        self.body.addLayout(row(self.choice, self.settings_button, (self.toolbar, 1)))
+        self.body.addWidget(self.toolbar)
+        self.body.addLayout(row(self.choice, None, self.settings_button, spacing=2))
         for plot in self.plots.values():
             self.body.addWidget(plot, 2)
         self.body.addWidget(self.shape_text)
@@ -114,7 +120,7 @@ class PsfPanel(Panel):
         self.plots: dict[str, Plot] = {PROFILE: profile, SECTION: self.section, ENERGY: energy}
         for plot in self.plots.values():
             plot.pin_left_axis()
-            plot.setMinimumHeight(110)
+            plot.setMinimumHeight(84)
 
     # ------------------------------------------------------------ plots
     def _show_plot(self) -> None:
@@ -151,7 +157,10 @@ class PsfPanel(Panel):
             self.shape = None
             self.shape_text.setText(f"no width: {error}")
             return
-        self.shape_text.setText(format_shape(self.shape, self.bench_geometry.psf_px))
+        text = format_shape(self.shape, self.bench_geometry.psf_px)
+        wide = self.width() >= self.context.theme.pixels(_WIDE)
+        self.shape_text.setText(text if wide else format_widths(self.shape))
+        self.shape_text.setToolTip(text)
         if self.choice.selected != ENERGY:
             return
         for key, view in self.image_views.items():
@@ -217,6 +226,11 @@ class PsfPanel(Panel):
             ExportArray(f"{key}_profile", data, "share per pixel") for key, data in self._profiles.items()
         ]
         return (*images, *profiles)
+
+
+def format_widths(shape: PsfShape) -> str:
+    """Width and radii of encircled energy in pixels, in one short line."""
+    return f"FWHM {shape.fwhm:.2f} px, 50 % {shape.r50:.1f} px, 80 % {shape.r80:.1f} px"
 
 
 def format_shape(shape: PsfShape, psf_px: float) -> str:
