@@ -41,6 +41,7 @@ from escape_gui.window.actions import ACTIONS, MENUS, format_shortcuts, help_pag
 from escape_gui.window.alarm_dialog import AlarmDialog
 from escape_gui.window.camera_dialog import CameraDialog
 from escape_gui.window.closing import CloseQuestion, is_busy
+from escape_gui.window.connect_dialog import ConnectDialog
 from escape_gui.window.docks import WORKSPACES, Dock, arrange_docks, hide_orphan_tab_bars, workspace
 from escape_gui.window.export import Exporter
 from escape_gui.window.header import AlarmBanner, ControlBanner, FaultBanner, FrozenBanner, HeaderBar
@@ -126,6 +127,7 @@ class MainWindow(QMainWindow):
             loop.load_button.clicked.connect(self.run_browser.open_list)
             self.run_browser.matrix_loaded.connect(lambda product: loop.choose_matrix(product.name))
         self.camera_dialogs = {name: CameraDialog(self, session, theme, name) for name in ("wfs", "science")}
+        self.connect_dialog = ConnectDialog(self, theme)
         self._connect_panels()
         #: Windows in which recorded runs were opened from this one.
         self.replay_windows: list[MainWindow] = []
@@ -171,6 +173,7 @@ class MainWindow(QMainWindow):
         session = self.context.session
         ask = session.ask
         return {
+            "connect": self.connect_dialog.open_list,
             "open_product": self.replay.ask_product,
             "runs": self.run_browser.open_list,
             "open_run": self.replay.ask_run,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -75,7 +77,7 @@ class FrameAverage:
         self.frames, self.count = 1, 0
         self._mean: NDArray[np.float32] | None = None
 
-    def __call__(self, frame: NDArray[np.number]) -> NDArray[np.number]:
+    def __call__(self, frame: NDArray[Any]) -> NDArray[Any]:
         """Add a frame ``(rows, columns)``; returns the mean, or the frame itself if ``frames`` is 1."""
         if self.frames == 1:
             self.clear()

@@ -348,8 +348,12 @@ class ImageToolbar(QWidget):
             action = self.menu.addAction("no average" if text == "1 frames" else str(text))
             action.setCheckable(True)
             group.addAction(action)
-            action.triggered.connect(lambda _=False, value=value: [apply(view, value) for view in self._all])
+            action.triggered.connect(lambda _=False, value=value: self._apply(apply, value))
             self.choices[kind, value] = action
+
+    def _apply(self, apply: Callable[[ImageViewer, Any], None], value: Any) -> None:
+        for view in self._all:
+            apply(view, value)
 
     def _show_choices(self) -> None:
         view, frames = self._view, self._view.average.frames
