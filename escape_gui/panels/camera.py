@@ -155,12 +155,13 @@ class CameraPanel(Panel):
             self._show_plot(frame)
 
     def _show_plot(self, frame: NDArray[Any]) -> None:
-        if self.plot_choice.selected == SECTION:
+        if not self.section.isHidden():
             shown = frame if self.image_view.data is None else self.image_view.data
             self.image_view.mark_section(self.section.show_image(shown))
         else:
             self.image_view.mark_section(None)
-            self._show_histogram(frame)
+            if not self.histogram.isHidden():
+                self._show_histogram(frame)
 
     def _on_pixel_clicked(self, x: int, y: int) -> None:
         """Put the section through a pixel; -1: through the brightest."""

@@ -47,7 +47,8 @@ MENUS = ("&File", "&View", "&Loop", "&Help")
 
 # fmt: off
 ACTIONS: tuple[Action, ...] = (
-    Action("connect", "&File", "&Connect…", "Connect to another server, or start one here.", ("Ctrl+Shift+C",)),
+    Action("connect", "&File", "&Connect…", "Connect to another server, or start one here.",
+           ("Ctrl+Shift+C",)),
     Action("open_product", "&File", "&Open product…", "Show a FITS product in these panels.", ("Ctrl+O",)),
     Action("runs", "&File", "Runs and &matrices…", "Finished runs: load a matrix into the loop, or replay.",
            ("Ctrl+M",)),

@@ -55,6 +55,7 @@ class ConnectDialog(QDialog):
         self.system = QComboBox()
         self.system.setAccessibleName("System to serve")
         self.system.addItems(bundled_systems())
+        self.system.setCurrentText("razor-shwfs")
         self.file_button, self.start_button = QPushButton("File…"), QPushButton("Start here")
         self.start_button.setToolTip("Serve this system with simulated devices, and connect to it.")
         self.message = text_label()

@@ -36,6 +36,7 @@ from escape_hw.remote.state import (
     Geometry,
     Lease,
     LogLine,
+    OffsetsState,
     Phase,
     PokePlan,
     ProcedureEntry,
@@ -622,6 +623,40 @@ class Connection:
             The bench is not idle, there is no such actuator or mode, or the poke exceeds a limit.
         """
         self._request("poke", SLOW_TIMEOUT_S, kind=kind, number=number, amplitude=amplitude, seconds=seconds)
+
+    def set_offsets(
+        self, terms: Mapping[str, float] | None = None, *, references: str = "keep", flat: str = "keep"
+    ) -> OffsetsState:
+        """Set the offsets of the mirror at rest and of what a closed loop converges to.
+
+        Parameters
+        ----------
+        terms
+            All terms, in nm rms wavefront: ``tip``, ``tilt``, ``focus``, ``mode 12``; ``None``: as they are.
+        references, flat
+            ``"keep"``, ``"clear"`` or ``"present"``: the mean of the present slopes as reference of the loop,
+            and the present shape of the mirror as flat.
+
+        Raises
+        ------
+        RequestRefused
+            A procedure runs, or a limit of the mirror forbids it; nothing changed.
+        """
+        answer, _ = self._request(
+            "set_offsets", SLOW_TIMEOUT_S, terms=None if terms is None else dict(terms),
+            references=references, flat=flat,
+        )  # fmt: skip
+        return OffsetsState.model_validate(answer)
+
+    def save_offsets(self, name: str) -> OffsetsState:
+        """Save the present offsets on the server."""
+        answer, _ = self._request("save_offsets", SLOW_TIMEOUT_S, name=name)
+        return OffsetsState.model_validate(answer)
+
+    def load_offsets(self, name: str) -> OffsetsState:
+        """Restore saved offsets, one of ``state.offsets.saved``."""
+        answer, _ = self._request("load_offsets", SLOW_TIMEOUT_S, name=name)
+        return OffsetsState.model_validate(answer)
 
     def record(self, on: bool) -> None:
         """Start or stop recording telemetry at full rate."""

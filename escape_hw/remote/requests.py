@@ -187,9 +187,26 @@ class PokeRequest(Request):
     seconds: Annotated[float, Field(ge=0.1, le=LONGEST_POKE_S, allow_inf_nan=False)] = 2.0
 
 
+class OffsetsRequest(Request):
+    """Set, save or load the offsets; answered with :class:`~escape_hw.remote.state.OffsetsState`.
+
+    ``set_offsets``
+        ``terms`` replace all terms, nm rms wavefront by name. ``references`` and ``flat``: keep them, clear
+        them, or use the mean of the present slopes and the present shape of the mirror.
+    ``save_offsets``, ``load_offsets``
+        By ``name``.
+    """
+
+    verb: Literal["set_offsets", "save_offsets", "load_offsets"]
+    terms: dict[Name, Annotated[float, Field(ge=-1e5, le=1e5, allow_inf_nan=False)]] | None = None
+    references: Literal["keep", "clear", "present"] = "keep"
+    flat: Literal["keep", "clear", "present"] = "keep"
+    name: Name = "offsets"
+
+
 AnyRequest = Annotated[
     PlainRequest | RegisterClient | GetLog | GetLatestSample | AcquireLease | ProcedureRequest | CloseLoop
-    | SetLoop | LoadProduct | SetRecording | CameraRequest | PokeRequest,
+    | SetLoop | LoadProduct | SetRecording | CameraRequest | PokeRequest | OffsetsRequest,
     Field(discriminator="verb"),
 ]  # fmt: skip
 
@@ -217,6 +234,7 @@ SAFETY_VERBS = frozenset({"open_loop", "flatten", "abort_procedure"})
 LEASE_VERBS = frozenset({
     "start_procedure", "pause_procedure", "resume_procedure", "close_loop", "set_loop", "load_product",
     "set_recording", "clear_fault", "shutdown", "set_camera", "poke",
+    "set_offsets", "save_offsets", "load_offsets",
 })  # fmt: skip
 #: Requests that change the state.
 STATE_CHANGING_VERBS = SAFETY_VERBS | LEASE_VERBS - {"shutdown"} | {"acquire_lease", "release_lease"}

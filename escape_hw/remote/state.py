@@ -218,6 +218,18 @@ class ProductEntry(StateDocument):
     summary: str = ""
 
 
+class OffsetsState(StateDocument):
+    """Offsets of the mirror and of the loop's reference slopes."""
+
+    #: nm rms wavefront by name: ``tip``, ``tilt``, ``focus``, ``mode 12``.
+    terms: dict[str, float] = Field(default_factory=dict)
+    #: Whether reference slopes were measured, and whether there is a flat other than zeros.
+    references: bool = False
+    flat: bool = False
+    #: Offsets saved on the server, by name.
+    saved: tuple[str, ...] = ()
+
+
 class RecordingState(StateDocument):
     """Recording of telemetry at full rate; numbers of entries."""
 
@@ -271,6 +283,7 @@ class State(StateDocument):
     last_run: FinishedRun | None = None
     products: tuple[ProductEntry, ...] = ()
     recording: RecordingState = RecordingState()
+    offsets: OffsetsState = OffsetsState()
     disk: DiskState = DiskState()
     streams: tuple[StreamEntry, ...] = ()
     #: Increases whenever the sensor's geometry changes.

@@ -161,3 +161,57 @@ def test_a_dark_frame_is_measured_with_the_beam_stop_and_a_flat_needs_uniform_li
     facts = {one.name: one.facts for one in bench.state.devices}["wfs"]
     assert facts["dark"] == "none"
     bench.set_camera("wfs", exposure_s=exposure)
+
+
+def test_offsets_move_the_mirror_at_rest_and_are_saved_and_restored(bench: Connection) -> None:
+    state = bench.set_offsets({"focus": 60.0, "mode 4": -20.0})
+    assert state.terms == {"focus": 60.0, "mode 4": -20.0}
+    assert bench.state.offsets.terms == state.terms
+    focus = bench.latest("commands").data
+    assert focus.any()
+    bench.flatten()
+    assert np.array_equal(bench.latest("commands").data, focus), "flat includes the offsets"
+    assert bench.save_offsets("night 1").saved == ("night-1",)
+    bench.set_offsets({})
+    assert not bench.latest("commands").data.any()
+    assert bench.load_offsets("night-1").terms == state.terms
+    assert np.allclose(bench.latest("commands").data, focus)
+    bench.set_offsets({}, flat="present")
+    assert bench.state.offsets.flat
+    bench.set_offsets(flat="clear")
+    assert bench.state.offsets.saved == ("night-1",)
+    with pytest.raises(RequestRefused, match="flat command rejected"):
+        bench.set_offsets({"focus": 50_000.0})
+    assert not bench.latest("commands").data.any()
+    with pytest.raises(ConfigError, match="no term"):
+        bench.set_offsets({"coma": 1.0})
+
+
+def test_a_closed_loop_converges_to_the_offset(bench: Connection, matrix: str) -> None:
+    bench.close_loop(matrix, gain=0.4, leak=0.0)
+
+    def mean_command() -> np.ndarray:
+        seen: dict[int, np.ndarray] = {}
+        wait_for(lambda: seen.setdefault((s := bench.latest("commands")).index, s.data.copy()) is None
+                 or len(seen) > 150, "commands")  # fmt: skip
+        return np.mean(list(seen.values()), axis=0)
+
+    wait_for(lambda: bench.state.loop.residual_nm > 0, "the loop is closed")
+    before = mean_command()
+    bench.set_offsets({"mode 3": 150.0})
+    frames = bench.state.rates.frames
+    wait_for(lambda: bench.state.rates.frames > frames + 400, "the loop settles")
+    moved = mean_command() - before
+    bench.set_offsets({})
+    bench.open_loop()
+    until_idle(bench)
+    bench.set_offsets({"mode 3": 150.0})
+    wanted = bench.latest("commands").data
+    bench.set_offsets({})
+    share = float(moved @ wanted / (wanted @ wanted))
+    assert share == pytest.approx(1.0, abs=0.35), "the mean shape of the loop has moved by the offset"
+
+
+def test_present_slopes_become_the_references(bench: Connection, matrix: str) -> None:
+    assert bench.set_offsets(references="present").references
+    assert bench.set_offsets(references="clear").references is False

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterable, Mapping
+from functools import partial
 from typing import Any
 
 from pydantic import ValidationError
@@ -11,8 +12,10 @@ from pydantic import ValidationError
 from escape_hw.errors import ConfigError, DeviceError, EscapeError, RequestRefused, SettingRejected
 from escape_hw.remote import requests
 from escape_hw.remote.requests import error_to_document
+from escape_hw.remote.state import OffsetsState
 from escape_hw.server.engine.bench_owner import REOPEN_REMEDY, BenchOwner
 from escape_hw.server.engine.camera_settings import CameraControl
+from escape_hw.server.engine.offsets import OffsetControl
 from escape_hw.server.engine.poke import PokeRunner
 from escape_hw.server.engine.procedures import ProcedurePlanner, ProcedureRegistry, needs_loop
 from escape_hw.server.engine.product_store import ProductStore
@@ -39,12 +42,14 @@ class RequestHandler:
         product_store: ProductStore,
         recording: TelemetryRecording,
         request_stop: Callable[[], object],
+        offsets: OffsetControl,
     ) -> None:
         self._owner, self._state, self._request_stop = owner, owner.state, request_stop
         self._loop_runner, self._procedure_runner = loop_runner, procedure_runner
         self._product_store, self._recording = product_store, recording
         self._procedures = ProcedureRegistry(owner.bench.config)
         self._planner = ProcedurePlanner(owner.bench)
+        self._offsets = offsets
         self._cameras, self._poke_runner = CameraControl(owner, loop_runner), PokeRunner(owner)
 
     def run(self, messages: Iterable[Mapping[str, Any]]) -> None:
@@ -117,9 +122,17 @@ class RequestHandler:
             case requests.PokeRequest():
                 self._poke_runner.start(request, lambda error: self._reply(number, error=error))
                 return DEFERRED
+            case requests.OffsetsRequest():
+                self._offsets.handle(request, partial(self._reply_offsets, number))
+                return DEFERRED
             case _:
                 raise RequestRefused(f"the engine has no request '{request.verb}'")
         return None
+
+    def _reply_offsets(self, number: int, state: OffsetsState | None, error: EscapeError | None) -> None:
+        if state is not None:
+            self._owner.state_publisher.publish()
+        self._reply(number, None if state is None else state.model_dump(mode="json"), error)
 
     def _set_camera(self, request: requests.CameraRequest, number: int) -> object:
         """Change a camera in the main thread, or the science camera of a closed loop at once."""

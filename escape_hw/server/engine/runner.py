@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from escape_hw.api.concurrency import SignalSafeFlag
+from escape_hw.api.offsets import Offsets
 from escape_hw.api.procedure import run as run_procedure
 from escape_hw.calibration.loop.control import LoopControl
 from escape_hw.calibration.loop.operation import run_until_opened
@@ -41,8 +42,11 @@ OnClosed = Callable[[EscapeError | None], object]
 class LoopRunner:
     """Closes the loop and changes its parameters."""
 
-    def __init__(self, owner: BenchOwner, product_store: ProductStore) -> None:
+    def __init__(
+        self, owner: BenchOwner, product_store: ProductStore, offsets: Callable[[], Offsets] = Offsets
+    ) -> None:
         self._owner, self._bench, self._state = owner, owner.bench, owner.state
+        self._offsets = offsets
         self._product_store = product_store
         #: PSF without turbulence ``(rows, columns)``, once measured; the running Strehl ratio needs it.
         self.model_psf: NDArray[np.float32] | None = None
@@ -57,6 +61,7 @@ class LoopRunner:
         control = LoopControl(
             self._bench, self._load_matrix(settings.matrix).result,
             gain=settings.gain, leak=settings.leak, dropped_modes=settings.dropped_modes,
+            offsets=self._offsets(),
         )  # fmt: skip
         return settings, control
 

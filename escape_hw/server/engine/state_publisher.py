@@ -29,6 +29,7 @@ from escape_hw.remote.state import (
     LatencyState,
     LoopState,
     MirrorState,
+    OffsetsState,
     RecordingState,
     State,
 )
@@ -65,6 +66,8 @@ class StatePublisher:
         self._publisher, self._product_store = publisher, product_store
         self._runs, self._emit, self._recording = runs, emit, recording
         self._clock = clock
+        #: Offsets of mirror and loop.
+        self.offsets: Callable[[], OffsetsState] = OffsetsState
         self._emit_lock = threading.Lock()
         self._last: tuple[float, Frame | None] = (0.0, None)
         self._rate, self._lost, self._counted_frames = 0.0, 0, 0
@@ -106,7 +109,7 @@ class StatePublisher:
             rates=self._frame_counters(frame, now), mirror=self._mirror(), loop=self._loop(now),
             latency=_latency(now.loop_statistics),
             active_run=now.active_run, last_run=now.last_run, products=self._product_store.products,
-            recording=self._recording(), disk=self._disk(), streams=publisher.entries,
+            recording=self._recording(), offsets=self.offsets(), disk=self._disk(), streams=publisher.entries,
             geometry_version=publisher.geometry_version, illumination=illumination,
         )  # fmt: skip
 
