@@ -46,6 +46,7 @@ from escape_gui.window.docks import WORKSPACES, Dock, arrange_docks, hide_orphan
 from escape_gui.window.export import Exporter
 from escape_gui.window.header import AlarmBanner, ControlBanner, FaultBanner, FrozenBanner, HeaderBar
 from escape_gui.window.notifications import NotificationBar, StateNotifier
+from escape_gui.window.offsets_dialog import OffsetsDialog
 from escape_gui.window.run_browser import RunBrowser
 from escape_gui.window.update_timer import UpdateTimer
 from escape_hw.errors import StorageError
@@ -127,6 +128,7 @@ class MainWindow(QMainWindow):
             loop.load_button.clicked.connect(self.run_browser.open_list)
             self.run_browser.matrix_loaded.connect(lambda product: loop.choose_matrix(product.name))
         self.camera_dialogs = {name: CameraDialog(self, session, theme, name) for name in ("wfs", "science")}
+        self.offsets_dialog = OffsetsDialog(self, session, theme)
         self.connect_dialog = ConnectDialog(self, theme)
         self._connect_panels()
         #: Windows in which recorded runs were opened from this one.
@@ -153,6 +155,8 @@ class MainWindow(QMainWindow):
             if isinstance(panel, CameraPanel | PsfPanel):
                 panel.settings_requested.connect(lambda name: self.camera_dialogs[name].open_settings())
         mirror, modes = self.panels.get(MirrorPanel.name), self.panels.get(ModesPanel.name)
+        if isinstance(mirror, MirrorPanel):
+            mirror.offsets_requested.connect(self.offsets_dialog.open_offsets)
         if isinstance(mirror, MirrorPanel) and isinstance(modes, ModesPanel):
             modes.mosaic.chosen.connect(mirror.choose_mode)
 
@@ -332,7 +336,7 @@ class MainWindow(QMainWindow):
             action.setEnabled(not reason)
             keys = f" ({format_shortcuts(one.keys)})" if one.keys and not reason else ""
             action.setToolTip(tooltip(f"{one.tip}{keys}", reason))
-        for dialog in self.camera_dialogs.values():
+        for dialog in (*self.camera_dialogs.values(), self.offsets_dialog):
             if dialog.isVisible():
                 dialog.update_buttons()
         for dock in self.docks.values():

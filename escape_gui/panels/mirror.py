@@ -8,6 +8,7 @@ from typing import Any, ClassVar
 import numpy as np
 import pyqtgraph as pg
 from numpy.typing import NDArray
+from PySide6.QtCore import Signal
 from PySide6.QtWidgets import QPushButton, QWidget
 
 from escape_gui.client.availability import (
@@ -24,6 +25,7 @@ from escape_gui.widgets.controls import (
     SegmentedButton,
     caption,
     column,
+    flat_button,
     readout_grid,
     row,
     set_available,
@@ -70,6 +72,9 @@ class MirrorPanel(Panel):
         "The mirror is flat and no command was sent yet.\nStart a calibration, or close the loop."
     )
 
+    #: The offsets are to be shown.
+    offsets_requested = Signal()
+
     def __init__(self, context: Context) -> None:
         super().__init__(context)
         theme = context.theme
@@ -92,7 +97,9 @@ class MirrorPanel(Panel):
         }
         self._nm_per_stroke, self._state = 0.0, State()
         self.body.setSpacing(4)
-        self.body.addLayout(row(self.choice, None, self.scale))
+        self.offsets_button = flat_button("Offsets…", "Tip, tilt, focus, reference slopes and flat")
+        self.offsets_button.clicked.connect(self.offsets_requested)
+        self.body.addLayout(row(self.choice, self.offsets_button, None, self.scale))
         self.body.addWidget(self.image_view, 1)
         self.arm_button = QPushButton("Arm pokes")
         self.body.addLayout(row(self.arm_button, (ImageToolbar(theme, self.image_view), 1)))

@@ -27,6 +27,7 @@ from escape_hw.remote.state import (
     LogLine,
     LoopState,
     MirrorState,
+    OffsetsState,
     Phase,
     PokePlan,
     ProcedureEntry,
@@ -296,6 +297,34 @@ class ScriptedControl:
         self.asked[-1] = ("set_camera", self.asked[-1][1])
         self.camera = plan.planned
         return plan
+
+    #: Offsets, and those that are saved.
+    offsets = OffsetsState(saved=("night-1",))
+
+    def set_offsets(self, terms: Mapping[str, float] | None = None, **more: str) -> OffsetsState:
+        """Set the offsets."""
+        self._note("set_offsets", terms=terms, **more)
+        references, flat = more.get("references"), more.get("flat")
+        self.offsets = self.offsets.model_copy(
+            update={
+                **({} if terms is None else {"terms": dict(terms)}),
+                **({} if references == "keep" else {"references": references == "present"}),
+                **({} if flat == "keep" else {"flat": flat == "present"}),
+            }
+        )
+        return self.offsets
+
+    def save_offsets(self, name: str) -> OffsetsState:
+        """Save the offsets."""
+        self._note("save_offsets", name=name)
+        self.offsets = self.offsets.model_copy(update={"saved": (*self.offsets.saved, name)})
+        return self.offsets
+
+    def load_offsets(self, name: str) -> OffsetsState:
+        """Restore offsets."""
+        self._note("load_offsets", name=name)
+        self.offsets = self.offsets.model_copy(update={"terms": {"focus": 60.0, "mode 4": -20.0}})
+        return self.offsets
 
     def check_poke(self, kind: str, number: int, amplitude: float, seconds: float) -> PokePlan:
         """What a poke would do."""

@@ -20,6 +20,7 @@ from escape_gui.panels.psf import PsfPanel
 from escape_gui.views.images import mask_from_rows
 from escape_gui.widgets.controls import HOLD_MS
 from escape_gui.window.camera_dialog import CameraDialog
+from escape_gui.window.offsets_dialog import OffsetsDialog
 from escape_hw.remote.state import ActiveRun, LoopState, Phase
 
 MakeWindow = Callable[..., MainWindow]
@@ -210,3 +211,64 @@ def test_strokes_are_shown_in_nanometres_too(window: MainWindow, mirror: MirrorP
     assert mirror.readouts["peak"].text == "0.4120"
     assert mirror.readouts["peak_nm"].text == f"{0.412 * 3500:.0f}"
     assert "nm" in mirror.scale.text()
+
+
+# ---------------------------------------------------------------- offsets
+@pytest.fixture
+def offsets(window: MainWindow, mirror: MirrorPanel, qtbot: QtBot) -> OffsetsDialog:
+    qtbot.mouseClick(mirror.offsets_button, Qt.MouseButton.LeftButton)
+    return window.offsets_dialog
+
+
+def test_offsets_are_typed_applied_and_cleared(
+    offsets: OffsetsDialog, control: ScriptedControl, qtbot: QtBot
+) -> None:
+    for name, text in (("tip", "25"), ("mode", "-12.5")):
+        offsets.fields[name].setFocus()
+        offsets.fields[name].selectAll()
+        QTest.keyClicks(offsets.fields[name], text)
+    qtbot.mouseClick(offsets.buttons["apply"], Qt.MouseButton.LeftButton)
+    qtbot.waitUntil(lambda: offsets.message.text() == "Applied.")
+    assert control.asked[-1][1]["terms"] == {"tip": 25.0, "mode 4": -12.5}
+    assert offsets.current["tip"].text() == "25.0"
+    qtbot.mouseClick(offsets.buttons["zero"], Qt.MouseButton.LeftButton)
+    qtbot.waitUntil(lambda: control.asked[-1][1]["terms"] == {})
+    assert offsets.fields["tip"].value() == 0
+
+
+def test_references_and_flat_are_taken_from_the_present(
+    offsets: OffsetsDialog, control: ScriptedControl, qtbot: QtBot
+) -> None:
+    assert offsets.references.text() == "Reference slopes: of the matrix"
+    qtbot.mouseClick(offsets.buttons["present_slopes"], Qt.MouseButton.LeftButton)
+    qtbot.waitUntil(lambda: offsets.references.text() == "Reference slopes: measured")
+    qtbot.mouseClick(offsets.buttons["present_shape"], Qt.MouseButton.LeftButton)
+    qtbot.waitUntil(lambda: offsets.flat.text() == "Flat: set")
+    qtbot.mouseClick(offsets.buttons["clear_flat"], Qt.MouseButton.LeftButton)
+    qtbot.waitUntil(lambda: offsets.flat.text() == "Flat: zero")
+
+
+def test_offsets_are_saved_and_restored(
+    offsets: OffsetsDialog, control: ScriptedControl, idle: ScriptedSource, qtbot: QtBot
+) -> None:
+    assert "give a name" in offsets.buttons["save"].toolTip()
+    QTest.keyClicks(offsets.name, "m2 aligned")
+    qtbot.mouseClick(offsets.buttons["save"], Qt.MouseButton.LeftButton)
+    qtbot.waitUntil(lambda: offsets.saved.count() == 2)
+    idle.change(offsets=control.offsets)
+    offsets.update_buttons()
+    offsets.saved.setCurrentText("night-1")
+    qtbot.mouseClick(offsets.buttons["load"], Qt.MouseButton.LeftButton)
+    qtbot.waitUntil(lambda: offsets.current["focus"].text() == "60.0")
+    assert offsets.fields["mode"].value() == -20.0
+
+
+def test_offsets_that_the_server_refuses_say_why(
+    offsets: OffsetsDialog, control: ScriptedControl, idle: ScriptedSource, qtbot: QtBot
+) -> None:
+    control.refuse = "flat command rejected: 1.2 exceeds 1"
+    qtbot.mouseClick(offsets.buttons["apply"], Qt.MouseButton.LeftButton)
+    qtbot.waitUntil(lambda: "exceeds 1" in offsets.message.text())
+    idle.change(phase=Phase.PROCEDURE, active_run=ActiveRun(id=5, name="docrime", arguments={}, stage=""))
+    offsets.update_buttons()
+    assert "a procedure is running" in offsets.buttons["apply"].toolTip()
