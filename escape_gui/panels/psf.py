@@ -170,7 +170,10 @@ class PsfPanel(Panel):
                 self._energy_curves[key].setData(*encircled_energy(clean, (float(peak[0]), float(peak[1]))))
 
     def on_geometry(self) -> None:
-        self._shape_due = 0.0
+        # lambda/D is known now.
+        self._shape_due, self.dirty = 0.0, True
+
+    def redraw(self) -> None:
         self._measure_shape()
 
     def on_sample(self, stream: str, sample: Sample) -> None:
