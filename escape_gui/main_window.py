@@ -336,9 +336,11 @@ class MainWindow(QMainWindow):
             action.setEnabled(not reason)
             keys = f" ({format_shortcuts(one.keys)})" if one.keys and not reason else ""
             action.setToolTip(tooltip(f"{one.tip}{keys}", reason))
-        for dialog in (*self.camera_dialogs.values(), self.offsets_dialog):
+        for dialog in self.camera_dialogs.values():
             if dialog.isVisible():
                 dialog.update_buttons()
+        if self.offsets_dialog.isVisible():
+            self.offsets_dialog.update_buttons()
         for dock in self.docks.values():
             dock.show_health()
         self.state_notifier.update(state, connected=now.connected)

@@ -101,12 +101,12 @@ class PokeRunner:
             if not stop.is_set():
                 ramp_to(self._bench.dm, shape)
             log.info("poke: %s for %g s", description, seconds)
-            owner.observe(Progress(description, 0, math.ceil(seconds), "s"))
+            owner.observe(Progress(description, 0, math.ceil(seconds), "second"))
             owner.state_publisher.publish()
             on_begun(None)
             began = time.monotonic()
             while not stop.is_set() and (elapsed := time.monotonic() - began) < seconds:
-                owner.observe(Progress(description, int(elapsed), math.ceil(seconds), "s", elapsed))
+                owner.observe(Progress(description, int(elapsed), math.ceil(seconds), "second", elapsed))
                 owner.read_idle_frame()
         except EscapeError as error:
             failure = error

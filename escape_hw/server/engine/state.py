@@ -217,7 +217,7 @@ class EngineState:
         self._require_idle()
         self._stop = SignalSafeFlag()
         poke = ActiveRun(
-            id=POKE_ID, name="poke", arguments={}, stage=description, unit="s", started_utc=format_utc()
+            id=POKE_ID, name="poke", arguments={}, stage=description, unit="second", started_utc=format_utc()
         )
         self._set(active_run=poke, phase=Phase.PROCEDURE, paused=False, needs_loop=False)
         return self._stop
