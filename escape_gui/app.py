@@ -6,7 +6,8 @@ import logging
 import os
 import signal
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -73,34 +74,75 @@ def qt_application() -> QApplication:
 
 
 class WindowController(QObject):
-    """Connects a window to the server at an address, and stops ``local_server`` if the window started one."""
+    """Connects a window to the server at an address, and stops ``local_server`` if the window started one.
+
+    Without an address, the window is connected when its operator chooses a server. ``start_server`` starts
+    the server of a system.
+    """
 
     def __init__(
-        self, window: MainWindow, session: Session, address: str, local_server: LocalServer | None
+        self,
+        window: MainWindow,
+        session: Session,
+        address: str,
+        local_server: LocalServer | None,
+        start_server: Callable[[str], LocalServer] = LocalServer,
     ) -> None:
         super().__init__()
-        self.window, self.session, self.local_server = window, session, local_server
-        window.started_server = local_server is not None
+        self.window, self.session = window, session
+        self.local_server: LocalServer | None = None
         self._live: LiveSource | None = None
+        self.attachment: ServerAttachment | None = None
+        self._stopped: list[ServerAttachment] = []
+        self._start_server = start_server
+        window.connect_dialog.connect_requested.connect(self.connect_to)
+        window.connect_dialog.start_requested.connect(self.start_server)
+        if address:
+            self._attach(address, local_server)
+
+    def connect_to(self, address: str, local_server: LocalServer | None = None) -> None:
+        """Disconnect from the present server, which goes on, and connect to another one."""
+        self.session.set_source(EmptySource(), None)
+        if self.attachment is not None:
+            # Its thread may wait for a reply; it is joined when the window is closed.
+            self.attachment.stop()
+            self._stopped.append(self.attachment)
+        if self.local_server is not None:
+            self.local_server.leave()
+        self._live = None
+        self._attach(address, local_server)
+
+    def start_server(self, system: str) -> None:
+        """Serve a system on this computer with simulated devices, and connect to it."""
+        self.connect_to(load_system(system).system.name, self._start_server(system))
+
+    def _attach(self, address: str, local_server: LocalServer | None) -> None:
+        self.local_server = local_server
+        self.window.started_server = local_server is not None
         self.attachment = ServerAttachment(address)
         self.attachment.attached.connect(self._attached)
         self.attachment.connection_failed.connect(self._connection_failed)
         self.attachment.start()
 
     def _attached(self, live: LiveSource) -> None:
+        if self.attachment is None or live is not self.attachment.live:
+            return  # of the connection before
         old, self._live = self._live, live
         self.session.set_source(live, live.connection)
         self.window.notifications.close_messages(_NO_SERVER)
+        self.window.connect_dialog.accept()
         if old is not None:
             self.attachment.discard(old)
         if self.local_server is not None:
             self.window.take_control()
 
     def _connection_failed(self, reason: str) -> None:
-        if self.local_server is None:
-            self.window.notifications.show_message(Level.ERROR, _NO_SERVER, reason)
-        elif exit_message := self.local_server.exit_message:
-            self.window.notifications.show_message(Level.ERROR, "The server did not start", exit_message)
+        title = _NO_SERVER
+        if self.local_server is not None:
+            title, reason = "The server did not start", self.local_server.exit_message
+        if reason:
+            self.window.connect_dialog.show_error(reason)
+            self.window.notifications.show_message(Level.ERROR, title, reason)
 
     def close(self) -> None:
         """Disconnect, and stop the local server unless it is left running. Close the session first."""
@@ -108,7 +150,9 @@ class WindowController(QObject):
             self.local_server.leave()
         elif self.local_server is not None:
             self.local_server.terminate(None if self._live is None else self._live.connection)
-        self.attachment.close()
+        for attachment in (*self._stopped, self.attachment):
+            if attachment is not None:
+                attachment.close()
 
 
 def run(system: str, address: str, screenshot: Path | None, reset_settings: bool) -> int:
@@ -140,7 +184,9 @@ def run(system: str, address: str, screenshot: Path | None, reset_settings: bool
     qt_app = qt_application()
     recording = bool(system) and is_recording(Path(system))
     address, local_server = ("", None) if recording else _find_or_start_server(system, address)
-    # After the start of a local server, whose engine must keep the normal priority.
+    # Niceness is that of a thread: servers are started by one that keeps the normal priority.
+    starter = ThreadPoolExecutor(1, thread_name_prefix="escape-gui-starter")
+    starter.submit(os.nice, 0).result()
     os.nice(_NICENESS)
     settings_path = settings_file()
     settings, warnings = (Settings(), ()) if reset_settings else load_settings(settings_path)
@@ -151,11 +197,11 @@ def run(system: str, address: str, screenshot: Path | None, reset_settings: bool
         window.notifications.show_message(Level.WARNING, "Settings", warning)
     if screenshot is not None:
         _take_screenshot(window, session, screenshot)
-    controller = None
+    controller = WindowController(
+        window, session, address, local_server, lambda name: starter.submit(LocalServer, name).result()
+    )
     if recording:
         window.show_recording(ReplaySource(system))
-    else:
-        controller = WindowController(window, session, address, local_server)
     window.update_timer.start()
     if screenshot is None:
         window.fit_to_screen(window.screen().availableGeometry())
@@ -166,8 +212,8 @@ def run(system: str, address: str, screenshot: Path | None, reset_settings: bool
         return code if screenshot is None or not isinstance(session.source, EmptySource) else 1
     finally:
         session.close()
-        if controller is not None:
-            controller.close()
+        controller.close()
+        starter.shutdown()
 
 
 def _find_or_start_server(system: str, address: str) -> tuple[str, LocalServer | None]:

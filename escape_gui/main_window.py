@@ -27,7 +27,11 @@ from escape_gui.client.availability import tooltip
 from escape_gui.client.session import Session
 from escape_gui.panels import PANELS
 from escape_gui.panels.base import Context, Panel
+from escape_gui.panels.camera import CameraPanel
 from escape_gui.panels.loop import LoopPanel
+from escape_gui.panels.mirror import MirrorPanel
+from escape_gui.panels.modes import ModesPanel
+from escape_gui.panels.psf import PsfPanel
 from escape_gui.panels.telemetry import TelemetryPanel
 from escape_gui.replay.playback import PlaybackBar, RecordingOpener
 from escape_gui.replay.source import ReplaySource
@@ -36,11 +40,14 @@ from escape_gui.theme import Theme
 from escape_gui.widgets.controls import Level, Overlay, column
 from escape_gui.window.actions import ACTIONS, MENUS, format_shortcuts, help_page, keyboard_table
 from escape_gui.window.alarm_dialog import AlarmDialog
+from escape_gui.window.camera_dialog import CameraDialog
 from escape_gui.window.closing import CloseQuestion, is_busy
+from escape_gui.window.connect_dialog import ConnectDialog
 from escape_gui.window.docks import WORKSPACES, Dock, arrange_docks, arrange_tab_bars, workspace
 from escape_gui.window.export import Exporter
 from escape_gui.window.header import AlarmBanner, ControlBanner, FaultBanner, FrozenBanner, HeaderBar
 from escape_gui.window.notifications import NotificationBar, StateNotifier
+from escape_gui.window.offsets_dialog import OffsetsDialog
 from escape_gui.window.recording_browser import RecordingBrowser
 from escape_gui.window.run_browser import RunBrowser
 from escape_gui.window.update_timer import UpdateTimer
@@ -127,6 +134,10 @@ class MainWindow(QMainWindow):
         if isinstance(telemetry, TelemetryPanel):
             telemetry.browse_button.clicked.connect(self.recording_browser.open_list)
             self.recording_browser.opened.connect(telemetry.open_recording)
+        self.camera_dialogs = {name: CameraDialog(self, session, theme, name) for name in ("wfs", "science")}
+        self.offsets_dialog = OffsetsDialog(self, session, theme)
+        self.connect_dialog = ConnectDialog(self, theme)
+        self._connect_panels()
         #: Windows in which recorded runs were opened from this one.
         self.replay_windows: list[MainWindow] = []
         #: Whether this window started the server, and whether that server goes on without the window.
@@ -145,6 +156,17 @@ class MainWindow(QMainWindow):
         self._restore()
 
     # ------------------------------------------------------------ construction
+    def _connect_panels(self) -> None:
+        """Connect panels with dialogs and with each other."""
+        for panel in self.panels.values():
+            if isinstance(panel, CameraPanel | PsfPanel):
+                panel.settings_requested.connect(lambda name: self.camera_dialogs[name].open_settings())
+        mirror, modes = self.panels.get(MirrorPanel.name), self.panels.get(ModesPanel.name)
+        if isinstance(mirror, MirrorPanel):
+            mirror.offsets_requested.connect(self.offsets_dialog.open_offsets)
+        if isinstance(mirror, MirrorPanel) and isinstance(modes, ModesPanel):
+            modes.mosaic.chosen.connect(mirror.choose_mode)
+
     def _make_actions(self) -> dict[str, QAction]:
         actions = {}
         for one in ACTIONS:
@@ -162,6 +184,7 @@ class MainWindow(QMainWindow):
         session = self.context.session
         ask = session.ask
         return {
+            "connect": self.connect_dialog.open_list,
             "open_product": self.replay.ask_product,
             "runs": self.run_browser.open_list,
             "open_run": self.replay.ask_run,
@@ -322,6 +345,11 @@ class MainWindow(QMainWindow):
             action.setEnabled(not reason)
             keys = f" ({format_shortcuts(one.keys)})" if one.keys and not reason else ""
             action.setToolTip(tooltip(f"{one.tip}{keys}", reason))
+        for dialog in self.camera_dialogs.values():
+            if dialog.isVisible():
+                dialog.update_buttons()
+        if self.offsets_dialog.isVisible():
+            self.offsets_dialog.update_buttons()
         for dock in self.docks.values():
             dock.show_health()
         self.state_notifier.update(state, connected=now.connected)

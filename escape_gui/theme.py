@@ -220,6 +220,9 @@ QLineEdit:disabled, QDoubleSpinBox:disabled, QComboBox:disabled { color: @muted;
 QComboBox::drop-down { border: none; width: @16px; padding-right: @2px; }
 QComboBox::down-arrow { image: url(@arrow); width: @12px; height: @12px; }
 QComboBox QAbstractItemView { background: @field; color: @text; border: 1px solid @line; }
+QCheckBox::indicator { width: @12px; height: @12px; border: 1px solid @muted; border-radius: 3px;
+    background: @field; }
+QCheckBox::indicator:checked { background: @accent; border: 1px solid @accent; }
 QTableView, QPlainTextEdit, QTextBrowser, QListView { background: @field; color: @text;
     border: 1px solid @line; border-radius: 4px; }
 QHeaderView::section { background: @panel; color: @muted; border: none; padding: @2px @6px; }

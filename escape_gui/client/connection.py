@@ -125,10 +125,19 @@ class ServerAttachment(QObject):
     def discard(self, old: LiveSource) -> None:
         self._jobs.put(old.connection.close)
 
-    def close(self) -> None:
-        """Stop the thread and disconnect; the source must not be used afterwards."""
+    @property
+    def live(self) -> LiveSource | None:
+        """The newest connection."""
+        return self._live
+
+    def stop(self) -> None:
+        """Ask the thread to disconnect and end; the source must not be used afterwards."""
         self._stop.set()
         self._jobs.put(lambda: None)
+
+    def close(self) -> None:
+        """Stop the thread and disconnect; the source must not be used afterwards."""
+        self.stop()
         if self._thread.is_alive():
             self._thread.join(timeout=10)
 

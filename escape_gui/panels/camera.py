@@ -8,13 +8,14 @@ from typing import Any, ClassVar
 import numpy as np
 import pyqtgraph as pg
 from numpy.typing import NDArray
+from PySide6.QtCore import Signal
 from PySide6.QtGui import QResizeEvent
 from PySide6.QtWidgets import QLabel, QToolButton
 
 from escape_gui.client.availability import UNKNOWN_VALUE, has_frames
 from escape_gui.panels.base import Context, ExportArray, Panel
 from escape_gui.views.images import mask_from_rows, slope_map_pair
-from escape_gui.widgets.controls import SegmentedButton, row
+from escape_gui.widgets.controls import SegmentedButton, flat_button, row
 from escape_gui.widgets.images import (
     DIVERGING_MAPS,
     SEQUENTIAL_MAPS,
@@ -23,11 +24,16 @@ from escape_gui.widgets.images import (
     Quiver,
     outline_points,
 )
-from escape_gui.widgets.plots import Plot
+from escape_gui.widgets.plots import Plot, SectionPlot
 from escape_hw.remote.source import Sample
 from escape_hw.remote.state import State
 
 RAW, ARROWS, MAPS, DIFFERENCE = "raw", "arrows", "x | y", "difference"
+HISTOGRAM, SECTION = "histogram", "section"
+_PLOT_TIPS = (
+    "Number of pixels by brightness",
+    "Row and column through the pixel that was clicked, at first the brightest; a double click returns to it",
+)
 _TIPS = (
     "Raw frame", "Slopes as arrows over the frame", "Slopes in x and y as maps", "Frame minus the reference",
 )  # fmt: skip
@@ -55,6 +61,9 @@ class CameraPanel(Panel):
         "No frames yet.\nThey are shown once a server has opened the sensor's camera."
     )
 
+    #: Name of the camera whose settings are to be shown.
+    settings_requested = Signal(str)
+
     def __init__(self, context: Context) -> None:
         super().__init__(context)
         theme = context.theme
@@ -62,7 +71,7 @@ class CameraPanel(Panel):
         self.choice.chosen.connect(self._on_view_changed)
         self.set_reference_button = QToolButton()
         self.set_reference_button.setText("Set reference")
-        self.set_reference_button.setToolTip("Use this frame as reference for 'difference'")
+        self.set_reference_button.setToolTip("Use the present frame as reference")
         self.set_reference_button.clicked.connect(self._set_reference)
         self.saturation = QLabel()
         self.image_view = ImageViewer(theme, "Frame of the sensor", SEQUENTIAL_MAPS, unit="counts")
@@ -74,16 +83,29 @@ class CameraPanel(Panel):
         self.image_view.box.addItem(self._outlines)
         self.bars = (
             ImageToolbar(theme, self.image_view),
-            ImageToolbar(theme, self.signed, logarithmic=False),
+            ImageToolbar(theme, self.signed),
         )
+        self.plot_choice = SegmentedButton("Plot of the frame", (HISTOGRAM, SECTION), _PLOT_TIPS)
+        self.plot_choice.chosen.connect(self._on_view_changed)
+        self.section = SectionPlot(theme, "counts")
+        self.image_view.pixel_clicked.connect(self._on_pixel_clicked)
+        self.image_view.view.double_clicked.connect(lambda: self._on_pixel_clicked(-1, -1))
         self.histogram = Plot(theme, "Histogram of the frame", "counts", "pixels")
         self.histogram.setLogMode(x=False, y=True)
         self._curve = self.histogram.curve(0, alone=True, stepMode="center")
         self.body.addLayout(row(self.choice, None))
         for widget in (self.saturation, self.image_view, self.signed):
             self.body.addWidget(widget)
-        self.body.addLayout(row(self.set_reference_button, *((bar, 1) for bar in self.bars)))
+        self.settings_button = flat_button(
+            "Settings…", "Exposure, gain, region, dark and flat of this camera"
+        )
+        self.settings_button.clicked.connect(lambda: self.settings_requested.emit("wfs"))
+        self.body.addLayout(
+            row(self.set_reference_button, self.settings_button, *((bar, 1) for bar in self.bars))
+        )
+        self.body.addWidget(self.plot_choice)
         self.body.addWidget(self.histogram)
+        self.body.addWidget(self.section)
         self.body.setStretchFactor(self.image_view, 1)
         self.body.setStretchFactor(self.signed, 1)
         self._frame: NDArray[Any] | None = None
@@ -131,7 +153,22 @@ class CameraPanel(Panel):
         if now >= self._histogram_due:
             self._histogram_due = now + _HISTOGRAM_PERIOD_S
             self.image_view.mark_pixels(None if self._full_scale is None else frame >= self._full_scale)
-            self._show_histogram(frame)
+            self._show_plot(frame)
+
+    def _show_plot(self, frame: NDArray[Any]) -> None:
+        if not self.section.isHidden():
+            shown = frame if self.image_view.data is None else self.image_view.data
+            self.image_view.mark_section(self.section.show_image(shown))
+        else:
+            self.image_view.mark_section(None)
+            if not self.histogram.isHidden():
+                self._show_histogram(frame)
+
+    def _on_pixel_clicked(self, x: int, y: int) -> None:
+        """Put the section through a pixel; -1: through the brightest."""
+        self.section.place = (x, y) if x >= 0 else None
+        self._histogram_due = 0.0
+        self._show_frame()
 
     def _show_histogram(self, frame: NDArray[Any]) -> None:
         step = max(1, int(np.sqrt(frame.size / _MAX_SAMPLED_PIXELS)))
@@ -158,15 +195,21 @@ class CameraPanel(Panel):
         signed = self.choice.selected in (MAPS, DIFFERENCE)
         for widget in (self.image_view, self.bars[0]):
             widget.setVisible(not signed)
+        self.set_reference_button.setVisible(self.choice.selected == DIFFERENCE)
         for widget in (self.signed, self.bars[1]):
             widget.setVisible(signed)
         self.quiver.setVisible(self.choice.selected == ARROWS)
         high = self.height() >= self.context.theme.pixels(_MIN_HEIGHT_FOR_HISTOGRAM)
-        self.histogram.setVisible(high and not signed)
+        plotted = self.plot_choice.selected
+        self.histogram.setVisible(high and not signed and plotted == HISTOGRAM)
+        self.section.setVisible(high and not signed and plotted == SECTION)
+        self.plot_choice.setVisible(high and not signed)
 
-    def _on_view_changed(self, view: str) -> None:
+    def _on_view_changed(self, _: str) -> None:
+        view = self.choice.selected
         self._update_visibility()
         self.signed.clear()
+        self._histogram_due = 0.0
         if view == DIFFERENCE and self._reference is None:
             self._set_reference()
         self._show_frame()
@@ -177,7 +220,7 @@ class CameraPanel(Panel):
             self._reference = self._frame.astype(np.float32)
 
     def clear(self) -> None:
-        self._frame = self._reference = self._slopes = None
+        self._frame = self._reference = self._slopes = self.section.place = None
         self.image_view.clear()
         self.signed.clear()
 
@@ -185,6 +228,7 @@ class CameraPanel(Panel):
         theme = self.context.theme
         self.saturation.setFont(theme.font(0.9, mono=True))
         self.histogram.setFixedHeight(theme.pixels(92))
+        self.section.setFixedHeight(theme.pixels(120))
         colour = theme.series(1)
         colour.setAlpha(90)
         self._outlines.setPen(pg.mkPen(colour, width=1))

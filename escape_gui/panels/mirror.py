@@ -1,21 +1,59 @@
-"""Deformable mirror: commands, and measured positions if available."""
+"""Deformable mirror: commands, measured positions if available, and pokes of single actuators and modes."""
 
 from __future__ import annotations
 
+import time
 from typing import Any, ClassVar
 
 import numpy as np
+import pyqtgraph as pg
 from numpy.typing import NDArray
+from PySide6.QtCore import Signal
+from PySide6.QtWidgets import QPushButton, QWidget
 
-from escape_gui.client.availability import UNKNOWN_VALUE, is_measured
+from escape_gui.client.availability import (
+    UNKNOWN_VALUE,
+    RequestContext,
+    is_measured,
+    reason_no_start,
+)
 from escape_gui.panels.base import Context, ExportArray, Panel
 from escape_gui.views.images import ActuatorImage
-from escape_gui.widgets.controls import Readout, SegmentedButton, caption, readout_grid, row
+from escape_gui.widgets.controls import (
+    HoldButton,
+    Readout,
+    SegmentedButton,
+    caption,
+    column,
+    flat_button,
+    readout_grid,
+    row,
+    set_available,
+    text_label,
+)
 from escape_gui.widgets.images import DIVERGING_MAPS, ImageToolbar, ImageViewer
-from escape_hw.remote.source import Sample
-from escape_hw.remote.state import State
+from escape_gui.widgets.inputs import NumberBox
+from escape_hw.remote.requests import LONGEST_POKE_S
+from escape_hw.remote.source import DataSource, Sample
+from escape_hw.remote.state import Phase, PokePlan, State
 
 COMMAND, MEASURED = "command", "measured"
+ACTUATOR, MODE = "actuator", "mode"
+#: Time without a poke or an edit after which pokes are disarmed, seconds.
+ARMED_S = 120.0
+_POKE_TIP = "Poke it for the time given; the mirror returns to flat by itself."
+
+
+def reason_no_poke(now: RequestContext) -> str:
+    """Why nothing can be poked."""
+    if reason := reason_no_start(now):
+        return reason
+    state = now.state
+    if state.loop.closed:
+        return "the loop is closed; open it first"
+    if state.active_run is not None:
+        return "a poke is held" if state.active_run.name == "poke" else "a procedure is running"
+    return "" if state.phase is Phase.IDLE else "the bench is not idle"
 
 
 class MirrorPanel(Panel):
@@ -24,14 +62,18 @@ class MirrorPanel(Panel):
     name: ClassVar[str] = "mirror"
     title: ClassVar[str] = "Mirror"
     help: ClassVar[str] = (
-        "Command of each actuator as a fraction of its full stroke, at its position on the mirror; measured "
-        "positions for adaptive secondaries. Clipped: actuators at a limit, mean of the last second."
+        "Command of each actuator as a fraction of its full stroke and in nanometres of surface, at its "
+        "position on the mirror; measured positions for adaptive secondaries. Clipped: actuators at a limit, "
+        "mean of the last second. 'Arm pokes' lets you poke a clicked actuator or a mode."
     )
     streams: ClassVar[tuple[str, ...]] = ("commands", "measured_positions")
     rate_hz: ClassVar[float] = 20.0
     placeholder: ClassVar[str] = (
         "The mirror is flat and no command was sent yet.\nStart a calibration, or close the loop."
     )
+
+    #: The offsets are to be shown.
+    offsets_requested = Signal()
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
@@ -48,28 +90,184 @@ class MirrorPanel(Panel):
         self.scale = caption()
         self.readouts = {
             "rms": Readout(theme, "rms", "stroke", 6),
+            "rms_nm": Readout(theme, "=", "nm", 6),
             "peak": Readout(theme, "peak", "stroke", 6),
+            "peak_nm": Readout(theme, "=", "nm", 6),
             "clipped": Readout(theme, "clipped", "%", 6),
         }
-        self.body.addLayout(row(self.choice, None, self.scale))
+        self._nm_per_stroke, self._state = 0.0, State()
+        self.body.setSpacing(4)
+        self.offsets_button = flat_button("Offsets…", "Tip, tilt, focus, reference slopes and flat")
+        self.offsets_button.clicked.connect(self.offsets_requested)
+        self.body.addLayout(row(self.choice, self.offsets_button, None, self.scale))
         self.body.addWidget(self.image_view, 1)
-        self.body.addWidget(ImageToolbar(theme, self.image_view, logarithmic=False))
-        self.body.addLayout(readout_grid(self.readouts))
+        self.arm_button = QPushButton("Arm pokes")
+        self.body.addLayout(row(self.arm_button, (ImageToolbar(theme, self.image_view), 1)))
+        self._numbers = QWidget()
+        self._numbers.setLayout(readout_grid(self.readouts))
+        self.body.addWidget(self._numbers)
+        self._make_poke_controls()
         self._values: dict[str, NDArray[Any]] = {}
         self._map = ActuatorImage(self.bench_geometry)
         self._update_measured_button()
         self.apply_theme()
 
+    # ------------------------------------------------------------ pokes
+    def _make_poke_controls(self) -> None:
+        """The second step of a poke: choose, see the plan, hold the button."""
+        theme = self.context.theme
+        self.arm_button.setCheckable(True)
+        self.arm_button.toggled.connect(self._on_armed)
+        self.poke_kind = SegmentedButton(
+            "Poke of", (ACTUATOR, MODE), ("Click an actuator in the map", "Click a mode in 'Mode maps'")
+        )
+        self.poke_kind.chosen.connect(lambda _: self._on_poke_edit())
+        self.poke_number = NumberBox(1, 100_000, step=1, decimals=0)
+        self.poke_number.setValue(1)
+        self.poke_amplitude = NumberBox(-1, 1, step=0.01, decimals=3)
+        self.poke_amplitude.setValue(0.05)
+        self.poke_seconds = NumberBox(0.1, LONGEST_POKE_S, step=1, decimals=1)
+        self.poke_seconds.setValue(2.0)
+        for box, name in (
+            (self.poke_number, "Number of the actuator or mode"),
+            (self.poke_amplitude, "Amplitude, fraction of full stroke"),
+            (self.poke_seconds, "Duration in seconds"),
+        ):
+            box.setAccessibleName(name)
+            box.setToolTip(name)
+            box.edited.connect(self._on_poke_edit)
+        self.poke_text = text_label()
+        self.poke_button = HoldButton("poke", theme)
+        self.poke_button.confirmed.connect(self._poke)
+        self._poke_row = QWidget()
+        what = row(self.poke_kind, (self.poke_number, 1), spacing=4)
+        amount = row(
+            (self.poke_amplitude, 1), caption("of the stroke, for"), (self.poke_seconds, 1), caption("s"),
+            spacing=4,
+        )  # fmt: skip
+        last = row((self.poke_text, 1), self.poke_button)
+        column(what, amount, last, parent=self._poke_row, spacing=4)
+        self._poke_row.hide()
+        self.body.addWidget(self._poke_row)
+        self._spot = pg.ScatterPlotItem(symbol="o", size=16, brush=None)
+        self._spot.setZValue(8)
+        self.image_view.box.addItem(self._spot)
+        self._plan: PokePlan | None = None
+        self._armed_until = 0.0
+        self.image_view.pixel_clicked.connect(self._on_pixel_clicked)
+
+    def _on_armed(self, armed: bool) -> None:
+        self._poke_row.setVisible(armed)
+        # Room for the map, where actuators are clicked; rms and peak are in the header, too.
+        self._numbers.setHidden(armed)
+        self.arm_button.setText("Disarm pokes" if armed else "Arm pokes")
+        if not armed and self._is_held:
+            self.context.session.abort()
+        # The map of an idle mirror, which has sent no command yet.
+        if armed and COMMAND not in self._values and self._map.n_act:
+            self._values[COMMAND] = np.zeros(self._map.n_act)
+            self._update_image()
+        self._on_poke_edit()
+
+    def _on_pixel_clicked(self, x: int, y: int) -> None:
+        if self.arm_button.isChecked() and (number := int(self._map.numbers[y, x])) >= 0:
+            self._choose(ACTUATOR, number)
+
+    def choose_mode(self, number: int) -> None:
+        """Choose a mode, which is poked only if pokes are armed and the button is held."""
+        if self.arm_button.isChecked() and number >= 0:
+            self._choose(MODE, number)
+
+    def _choose(self, kind: str, number: int) -> None:
+        self.poke_kind.buttons[kind].setChecked(True)
+        self.poke_number.setValue(number + 1)
+        self._on_poke_edit()
+
+    def _on_poke_edit(self) -> None:
+        """Mark the actuator and request the plan of the poke."""
+        self._plan = None
+        self._armed_until = time.monotonic() + ARMED_S
+        number = round(self.poke_number.value()) - 1
+        armed, kind = self.arm_button.isChecked(), self.poke_kind.selected
+        rows, columns = np.nonzero(self._map.numbers == number)
+        marked = armed and kind == ACTUATOR and rows.size > 0
+        self._spot.setData([columns.mean() + 0.5] if marked else [], [rows.mean() + 0.5] if marked else [])
+        if not armed:
+            return
+        request = (kind, number, self.poke_amplitude.value(), self.poke_seconds.value())
+        for box in (self.poke_number, self.poke_amplitude, self.poke_seconds):
+            if not box.low <= box.value() <= box.high:
+                self.poke_text.setText(
+                    f"{box.accessibleName()}: {box.value():g} is out of range: {box.low:g} to {box.high:g}"
+                )
+                return
+        self.context.session.ask(
+            "plan the poke", lambda server: server.check_poke(*request),
+            lambda plan: self._show_plan(plan, request), self.poke_text.setText, quiet=True,
+        )  # fmt: skip
+
+    @property
+    def _poke_request(self) -> tuple[str, int, float, float]:
+        number = round(self.poke_number.value()) - 1
+        return self.poke_kind.selected, number, self.poke_amplitude.value(), self.poke_seconds.value()
+
+    def _show_plan(self, plan: PokePlan, request: tuple[str, int, float, float]) -> None:
+        if request == self._poke_request:
+            self._plan = plan
+            self.poke_text.setText(
+                plan.refusal or f"{plan.description} for {request[3]:g} s; limit ±{plan.allowed:.3g}"
+            )
+
+    def _poke(self) -> None:
+        if self._plan is None or not self.poke_button.isEnabled():
+            return
+        request, description = self._poke_request, self._plan.description
+        self._armed_until = time.monotonic() + ARMED_S
+        self.context.session.ask(
+            "poke the mirror", lambda server: server.poke(*request),
+            lambda _: self.poke_text.setText(f"Held: {description}"), self.poke_text.setText, quiet=True,
+        )  # fmt: skip
+
+    @property
+    def _is_held(self) -> bool:
+        run = self.context.session.source.state.active_run
+        return run is not None and run.name == "poke"
+
+    def tick(self, source: DataSource) -> None:
+        """Enable the buttons; disarm when nothing may be changed, or after a while without a poke."""
+        now = self.context.session.request_context
+        reason = reason_no_poke(now)
+        held, armed = self._is_held, self.arm_button.isChecked()
+        if armed and not held and (reason or time.monotonic() > self._armed_until):
+            self.arm_button.setChecked(False)
+        tip = "Allow pokes of single actuators and modes; each needs a second step."
+        set_available(self.arm_button, tip, "" if held else reason)
+        plan = self._plan
+        refused = "no plan yet" if plan is None else "see above" if plan.refusal else ""
+        set_available(self.poke_button, _POKE_TIP, reason or refused)
+        if armed and not held and plan is not None and self.poke_text.text().startswith("Held"):
+            self.poke_text.setText(f"Mirror flat again after: {plan.description}")
+
+    # ------------------------------------------------------------ data
     def on_geometry(self) -> None:
         self._map = ActuatorImage(self.bench_geometry)
+        self._nm_per_stroke = 1e9 * self.bench_geometry.stroke_m
+        self._show_numbers()
         self.image_view.clear()
         self._update_image()
 
     def on_state(self, state: State) -> None:
-        mirror = state.mirror
+        self._state = state
+        self._show_numbers()
+
+    def _show_numbers(self) -> None:
+        state, mirror = self._state, self._state.mirror
+        nm = self._nm_per_stroke
         values = {
             "rms": f"{mirror.rms:.4f}",
+            "rms_nm": f"{nm * mirror.rms:.0f}" if nm else UNKNOWN_VALUE,
             "peak": f"{mirror.peak:.4f}",
+            "peak_nm": f"{nm * mirror.peak:.0f}" if nm else UNKNOWN_VALUE,
             "clipped": f"{100 * mirror.saturated_share:.2f}",
         }
         for name, text in values.items():
@@ -90,24 +288,35 @@ class MirrorPanel(Panel):
             return
         if self.choice.selected == MEASURED:
             self.image_view.unit, values = "µm", values * 1e6
+            self.image_view.second_unit = None
         else:
-            self.image_view.unit = "stroke"
+            self.image_view.unit, nm = "stroke", self._nm_per_stroke
+            self.image_view.second_unit = (nm, "nm") if nm else None
         self.image_view.show_array(self._map.to_image(values))
-        self.scale.setText(f"±{self.image_view.levels[1]:.3g} {self.image_view.unit}")
+        level, second = self.image_view.levels[1], self.image_view.second_unit
+        nm_text = "" if second is None else f" = {second[0] * level:.0f} nm"
+        self.scale.setText(f"±{level:.3g} {self.image_view.unit}{nm_text}")
 
     def _update_measured_button(self) -> None:
         button = self.choice.buttons[MEASURED]
         button.setEnabled(MEASURED in self._values)
         button.setVisible(MEASURED in self._values)
+        self.choice.setVisible(MEASURED in self._values)
 
     def clear(self) -> None:
         self._values.clear()
         self.image_view.clear()
         self.choice.choose(COMMAND)
+        self.arm_button.setChecked(False)
         self._update_measured_button()
 
     def apply_theme(self) -> None:
-        self.scale.setFont(self.context.theme.font(0.9, mono=True))
+        theme = self.context.theme
+        self.scale.setFont(theme.font(0.9, mono=True))
+        self._spot.setPen(pg.mkPen(theme.colour("warn"), width=2))
+        for box, width in ((self.poke_number, 64), (self.poke_amplitude, 72), (self.poke_seconds, 64)):
+            box.setFont(theme.font(mono=True))
+            box.setMinimumWidth(theme.pixels(width))
 
     def export_arrays(self) -> tuple[ExportArray, ...]:
         units = {COMMAND: "stroke", MEASURED: "m"}

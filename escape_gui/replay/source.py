@@ -259,6 +259,8 @@ def _geometry_of(run: RunContent) -> Geometry:
         parts |= {
             "valid": _rows(grid.valid), "outlines_px": grid.outlines(), "n_modes": main[1].matrix.n_modes,
         }  # fmt: skip
+    if psf_px := run.document.get("bench", {}).get("psf_px"):
+        parts["psf_px"] = float(psf_px)
     if run.layout is not None:
         parts["layout"] = _rows(run.layout)
     if run.places_m is not None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -66,6 +68,29 @@ def _nearest_actuator(positions: NDArray[np.float64]) -> NDArray[np.intp]:
     x, y = (np.linspace(low[k], high[k], _IMAGE_WIDTH) for k in (0, 1))
     distance, number = tree.query(np.stack(np.meshgrid(x, y[::-1]), axis=-1))
     return np.where(distance <= 0.9 * pitch, number, -1)
+
+
+class FrameAverage:
+    """Mean of the frames shown last, with exponential weights that correspond to ``frames`` frames."""
+
+    def __init__(self) -> None:
+        self.frames, self.count = 1, 0
+        self._mean: NDArray[np.float32] | None = None
+
+    def __call__(self, frame: NDArray[Any]) -> NDArray[Any]:
+        """Add a frame ``(rows, columns)``; returns the mean, or the frame itself if ``frames`` is 1."""
+        if self.frames == 1:
+            self.clear()
+            return frame
+        if self._mean is None or self._mean.shape != frame.shape:
+            self._mean, self.count = frame.astype(np.float32), 1
+        else:
+            self.count = min(self.count + 1, self.frames)
+            self._mean = self._mean + (frame - self._mean) / np.float32(self.count)
+        return self._mean
+
+    def clear(self) -> None:
+        self._mean, self.count = None, 0
 
 
 class RadialProfile:

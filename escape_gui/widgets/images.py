@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 import pyqtgraph as pg
 from numpy.typing import NDArray
 from PySide6.QtCore import QPointF, QRectF, Qt, Signal
-from PySide6.QtGui import QKeyEvent, QMouseEvent
-from PySide6.QtWidgets import QLabel, QSizePolicy, QWidget
+from PySide6.QtGui import QAction, QActionGroup, QKeyEvent, QMouseEvent
+from PySide6.QtWidgets import QLabel, QMenu, QSizePolicy, QToolButton, QWidget
 
 from escape_gui.theme import Theme
+from escape_gui.views.images import FrameAverage
 from escape_gui.widgets.controls import column, flat_button, row
 from escape_hw.remote.state import Geometry
 
@@ -21,6 +22,12 @@ from escape_hw.remote.state import Geometry
 SEQUENTIAL_MAPS = ("CET-L1", "inferno", "cividis", "CET-CBL1")
 #: Colour map for signed values, suitable for any colour vision.
 DIVERGING_MAPS = ("CET-D1A",)
+#: Stretches of the grey values: from minimum to maximum, its logarithm or square root, and between two
+#: percentiles, which single bright or dark pixels do not change.
+STRETCHES = ("linear", "log", "square root", "percentile")
+PERCENTILES = (1.0, 99.7)
+#: Numbers of frames to average.
+AVERAGES = (1, 4, 16, 64, 256)
 #: Period of the automatic display range, and approximate number of pixels used for it.
 _LEVEL_UPDATE_S, _LEVEL_SAMPLE_PIXELS = 0.2, 20_000
 #: Range of a logarithmic image below its brightest pixel, decades.
@@ -47,6 +54,10 @@ class ImageViewer(QWidget):
 
     #: Position and value under the cursor, as text.
     cursor_changed = Signal(str)
+    #: Column and row of a pixel that was clicked.
+    pixel_clicked = Signal(int, int)
+    #: Stretch, colour map or number of averaged frames were changed.
+    display_changed = Signal()
 
     def __init__(
         self,
@@ -61,8 +72,12 @@ class ImageViewer(QWidget):
         super().__init__()
         self._theme, self._maps, self._symmetric = theme, tuple(maps), symmetric
         self.unit, self._min_level = unit, min_level
+        #: A second unit for the value under the cursor: factor and name.
+        self.second_unit: tuple[float, str] | None = None
+        #: The array shown: the mean of several if :attr:`average` is set so.
         self.data: NDArray[Any] | None = None
-        self.logarithmic = False
+        self.average = FrameAverage()
+        self.stretch = "linear" if symmetric else "percentile"
         #: The display range follows the data.
         self.automatic = True
         self.levels = (0.0, 1.0)
@@ -78,6 +93,11 @@ class ImageViewer(QWidget):
         self._marks.setZValue(5)
         self._marks.hide()
         self.box.addItem(self._marks)
+        self._section_lines = tuple(pg.InfiniteLine(angle=angle) for angle in (0, 90))
+        for line in self._section_lines:
+            line.setZValue(8)
+            line.hide()
+            self.box.addItem(line)
         self._cross = pg.TargetItem(movable=False, size=10)
         self._cross.setZValue(9)
         self._cross.hide()
@@ -88,7 +108,7 @@ class ImageViewer(QWidget):
         self.setAccessibleName(name)
         self.setMinimumSize(96, 96)
         self.view.scene().sigMouseMoved.connect(self._on_mouse_moved)
-        self.view.scene().sigMouseClicked.connect(lambda _: self.setFocus())
+        self.view.scene().sigMouseClicked.connect(lambda event: self._on_clicked(event.scenePos()))
         self.view.double_clicked.connect(self.reset_view)
         theme.follow(self._apply_theme)
         self.image.setColorMap(pg.colormap.get(self._maps[0]))
@@ -97,8 +117,13 @@ class ImageViewer(QWidget):
     def show_array(self, data: NDArray[Any]) -> None:
         """Show an array ``(rows, columns)`` of integers or floats."""
         new_shape = self.data is None or self.data.shape != data.shape
-        self.data = data
-        displayed = self._display_data(data)
+        self.data = self.average(data)
+        self._draw(new_shape)
+
+    def _draw(self, new_shape: bool = False) -> None:
+        if self.data is None:
+            return
+        displayed = self._display_data(self.data)
         now = time.monotonic()
         if new_shape or (self.automatic and now >= self._levels_due):
             self._levels_due = now + _LEVEL_UPDATE_S
@@ -122,7 +147,12 @@ class ImageViewer(QWidget):
         self._marks.show()
 
     def _display_data(self, data: NDArray[Any]) -> NDArray[Any]:
-        if not self.logarithmic:
+        if self.stretch == "square root":
+            # The square root of the light above the background.
+            low = float(np.nanpercentile(data, PERCENTILES[0])) if data.size else 0.0
+            root: NDArray[Any] = np.sqrt(np.maximum(data - low, 0), dtype=np.float32)
+            return root
+        if self.stretch != "log":
             return data if data.dtype != np.float64 else data.astype(np.float32)
         top = float(np.nanmax(data)) if data.size else 1.0
         floor = max(top, 1e-30) * 10**-DECADES
@@ -135,16 +165,28 @@ class ImageViewer(QWidget):
         sample = sample[np.isfinite(sample)]
         if sample.size == 0:
             return 0.0, 1.0
-        low, high = (float(value) for value in np.percentile(sample, (1.0, 99.7)))
+        low, high = (float(value) for value in np.percentile(sample, PERCENTILES))
         if self._symmetric:
             high = max(abs(low), abs(high), self._min_level)
             low = -high
-        elif self.logarithmic:
-            high = float(sample.max())
+        elif self.stretch != "percentile":
+            # The brightest pixel may be none of the sample.
+            high = float(np.nanmax(displayed))
+            low = float(np.nanmin(displayed)) if self.stretch == "linear" else low
         return (low, high) if high > low else (low - 0.5, low + 0.5)
+
+    def mark_section(self, place: tuple[int, int] | None) -> None:
+        """Mark the row and the column through a pixel (column, row)."""
+        for line in self._section_lines:
+            line.setVisible(place is not None)
+        if place is not None:
+            self._section_lines[0].setPos(place[1] + 0.5)
+            self._section_lines[1].setPos(place[0] + 0.5)
 
     def clear(self) -> None:
         self.data = None
+        self.average.clear()
+        self.mark_section(None)
         self.image.clear()
         self._marks.hide()
         self._cross.hide()
@@ -155,11 +197,32 @@ class ImageViewer(QWidget):
             rows, columns = self.data.shape
             self.box.setRange(QRectF(0, 0, columns, rows), padding=0.02)
 
-    def set_logarithmic(self, on: bool) -> None:
-        self.logarithmic = on
+    @property
+    def colour_map(self) -> int:
+        """Number of the colour map in the list."""
+        return self._map
+
+    @property
+    def colour_maps(self) -> tuple[str, ...]:
+        """Names of the colour maps."""
+        return self._maps
+
+    @property
+    def symmetric(self) -> bool:
+        """Whether the display range is symmetric about zero."""
+        return self._symmetric
+
+    def set_stretch(self, stretch: str) -> None:
+        """Use a stretch of :data:`STRETCHES`."""
+        self.stretch = stretch
         self._levels_due = 0.0
-        if self.data is not None:
-            self.show_array(self.data)
+        self._draw()
+        self.display_changed.emit()
+
+    def set_average(self, frames: int) -> None:
+        """Show the mean of so many frames."""
+        self.average.frames = frames
+        self.display_changed.emit()
 
     def set_automatic(self, on: bool) -> None:
         """Let the display range follow the data, or lock it."""
@@ -170,8 +233,15 @@ class ImageViewer(QWidget):
         """Use colour map ``number`` of the list, cyclic."""
         self._map = number % len(self._maps)
         self.image.setColorMap(pg.colormap.get(self._maps[self._map]))
+        self.display_changed.emit()
 
     # ------------------------------------------------------------ cursor and keys
+    def _on_clicked(self, position: QPointF) -> None:
+        self.setFocus()
+        self._on_mouse_moved(position)
+        if self._cursor is not None:
+            self.pixel_clicked.emit(*self._cursor)
+
     def _on_mouse_moved(self, position: QPointF) -> None:
         point = self.image.mapFromScene(position)
         self._set_cursor(int(np.floor(point.x())), int(np.floor(point.y())))
@@ -185,7 +255,10 @@ class ImageViewer(QWidget):
         self._cursor = (x, y)
         value = data[y, x]
         text = f"{value:d}" if np.issubdtype(data.dtype, np.integer) else f"{value:.4g}"
-        self.cursor_changed.emit(f"x {x:4d}  y {y:4d}  {text:>8} {self.unit}".rstrip())
+        second = (
+            "" if self.second_unit is None else f" = {self.second_unit[0] * value:.4g} {self.second_unit[1]}"
+        )
+        self.cursor_changed.emit(f"x {x:4d}  y {y:4d}  {text:>8} {self.unit}".rstrip() + second)
 
     def keyPressEvent(self, event: QKeyEvent) -> None:
         """Keys of :data:`escape_gui.window.actions.IMAGE_KEYS`."""
@@ -202,9 +275,11 @@ class ImageViewer(QWidget):
             self._levels_due = 0.0
             if self.data is not None:
                 self.levels = self._estimate_levels(self._display_data(self.data))
-                self.show_array(self.data)
-        elif key == Qt.Key.Key_L:
-            self.set_logarithmic(not self.logarithmic)
+                self._draw()
+        elif key in (Qt.Key.Key_Return, Qt.Key.Key_Enter) and self._cursor is not None:
+            self.pixel_clicked.emit(*self._cursor)
+        elif key == Qt.Key.Key_L and not self._symmetric:
+            self.set_stretch("percentile" if self.stretch == "log" else "log")
         elif key == Qt.Key.Key_R:
             self.reset_view()
         elif key == Qt.Key.Key_M:
@@ -219,29 +294,75 @@ class ImageViewer(QWidget):
     def _apply_theme(self) -> None:
         self.view.setBackground(self._theme.colours.field)
         self._cross.setPen(pg.mkPen(self._theme.colour("accent")))
+        for k, line in enumerate(self._section_lines):
+            colour = self._theme.series(k)
+            colour.setAlpha(140)
+            line.setPen(pg.mkPen(colour, width=1))
 
 
 class ImageToolbar(QWidget):
-    """Value under the cursor and controls of the display range of an image."""
+    """Value under the cursor, and a menu of stretch, colours and average.
 
-    def __init__(self, theme: Theme, image_view: ImageViewer, *, logarithmic: bool = True) -> None:
+    ``linked`` are further images that follow the menu.
+    """
+
+    def __init__(self, theme: Theme, image_view: ImageViewer, linked: Sequence[ImageViewer] = ()) -> None:
         super().__init__()
-        self._theme = theme
+        self._theme, self._view, self._all = theme, image_view, (image_view, *linked)
         self.cursor_value = QLabel()
         self.cursor_value.setTextFormat(Qt.TextFormat.PlainText)
         self.cursor_value.setAccessibleName("Value under the cursor")
         # A long value must not widen the dock.
         self.cursor_value.setSizePolicy(QSizePolicy.Policy.Ignored, QSizePolicy.Policy.Preferred)
-        image_view.cursor_changed.connect(self.cursor_value.setText)
-        buttons = []
-        if logarithmic:
-            tip = "Logarithmic scale (L)"
-            buttons.append(flat_button("log", tip, checkable=True, checked=image_view.logarithmic))
-            buttons[0].toggled.connect(image_view.set_logarithmic)
-        buttons.append(flat_button("Lock scale", "Lock the display range", checkable=True))
-        buttons[-1].toggled.connect(lambda on: image_view.set_automatic(not on))
-        row((self.cursor_value, 1), *buttons, parent=self, spacing=2)
+        for view in self._all:
+            view.cursor_changed.connect(self.cursor_value.setText)
+        self.display_button = flat_button("", "Stretch, colours and average of the image")
+        self.display_button.setPopupMode(QToolButton.ToolButtonPopupMode.InstantPopup)
+        self.menu = QMenu(self.display_button)
+        #: Entries by the kind of choice and its value.
+        self.choices: dict[tuple[str, object], QAction] = {}
+        if not image_view.symmetric:
+            self._add_choices("stretch", STRETCHES, lambda view, value: view.set_stretch(value))
+        self._add_choices(
+            "colour map", range(len(image_view.colour_maps)), lambda view, k: view.set_colour_map(k)
+        )
+        self._add_choices("average", AVERAGES, lambda view, n: view.set_average(n))
+        self.display_button.setMenu(self.menu)
+        lock = flat_button("Lock scale", "Lock the display range", checkable=True)
+        for view in self._all:
+            lock.toggled.connect(lambda on, view=view: view.set_automatic(not on))
+        row((self.cursor_value, 1), self.display_button, lock, parent=self, spacing=2)
+        image_view.display_changed.connect(self._show_choices)
+        self._show_choices()
         theme.follow(self._apply_theme)
+
+    def _add_choices(
+        self, kind: str, values: Sequence[Any], apply: Callable[[ImageViewer, Any], None]
+    ) -> None:
+        if len(values) < 2:
+            return
+        self.menu.addSection(kind.capitalize())
+        group = QActionGroup(self.menu)
+        names = {"colour map": self._view.colour_maps, "average": [f"{n} frames" for n in values]}
+        for value, text in zip(values, names.get(kind, values), strict=True):
+            action = self.menu.addAction("no average" if text == "1 frames" else str(text))
+            action.setCheckable(True)
+            group.addAction(action)
+            action.triggered.connect(lambda _=False, value=value: self._apply(apply, value))
+            self.choices[kind, value] = action
+
+    def _apply(self, apply: Callable[[ImageViewer, Any], None], value: Any) -> None:
+        for view in self._all:
+            apply(view, value)
+
+    def _show_choices(self) -> None:
+        view, frames = self._view, self._view.average.frames
+        for key in (("stretch", view.stretch), ("colour map", view.colour_map), ("average", frames)):
+            if key in self.choices:
+                self.choices[key].setChecked(True)
+        mean = f"mean of {frames}" if frames > 1 else ""
+        stretch = "" if view.symmetric else view.stretch
+        self.display_button.setText(", ".join(one for one in (stretch, mean) if one) or "Display")
 
     def _apply_theme(self) -> None:
         self.cursor_value.setFont(self._theme.font(0.9, mono=True))

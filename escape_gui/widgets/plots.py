@@ -90,6 +90,26 @@ class Plot(pg.PlotWidget):  # type: ignore[misc]
             item.setPen(self._pen(number, alone))
 
 
+class SectionPlot(Plot):
+    """Row and column of an image through a pixel, by default the brightest."""
+
+    def __init__(self, theme: Theme, unit: str) -> None:
+        super().__init__(theme, "Cross-section of the image", "pixel", unit)
+        self._row, self._column = self.curve(0, name="row"), self.curve(1, name="column")
+        #: Column and row of the pixel; ``None``: the brightest.
+        self.place: tuple[int, int] | None = None
+
+    def show_image(self, image: NDArray[Any]) -> tuple[int, int]:
+        """Show the sections of an image ``(rows, columns)``; returns the pixel they go through."""
+        x, y = self.place or (0, 0)
+        if self.place is None or not (x < image.shape[1] and y < image.shape[0]):
+            row, column = np.unravel_index(int(np.nanargmax(image)), image.shape)
+            x, y = int(column), int(row)
+        self._row.setData(np.arange(image.shape[1]), image[y])
+        self._column.setData(np.arange(image.shape[0]), image[:, x])
+        return x, y
+
+
 class StripChart(Plot):
     """A quantity over the last ``span_s`` seconds."""
 

@@ -47,6 +47,8 @@ MENUS = ("&File", "&View", "&Loop", "&Help")
 
 # fmt: off
 ACTIONS: tuple[Action, ...] = (
+    Action("connect", "&File", "&Connect…", "Connect to another server, or start one here.",
+           ("Ctrl+Shift+C",)),
     Action("open_product", "&File", "&Open product…", "Show a FITS product in these panels.", ("Ctrl+O",)),
     Action("runs", "&File", "Runs and &matrices…", "Finished runs: load a matrix into the loop, or replay.",
            ("Ctrl+M",)),
@@ -108,6 +110,7 @@ IMAGE_KEYS = (
     ("A", "autoscale once"),
     ("L", "logarithmic or linear"),
     ("R or double click", "reset view"),
+    ("click or Enter", "cross-section through this pixel; choose this actuator"),
     ("M", "next colour map"),
     ("arrows", "move the cursor by a pixel"),
 )

@@ -15,6 +15,8 @@ def is_busy(state: State) -> bool:
 
 def describe_activity(state: State) -> str:
     """What runs, in a sentence."""
+    if state.active_run is not None and state.active_run.name == "poke":
+        return "A poke is held; it returns to flat by itself."
     if state.active_run is not None:
         return f"'{state.active_run.name}' (run {state.active_run.id}) is running."
     return "The loop is closed." if state.loop.closed else "Nothing is running."

@@ -176,13 +176,14 @@ class Camera(Device):
         DeviceError
             The device failed; acquisition is stopped.
         """
-        achievable = self.check(want)
-        running = self._running
-        self.stop()
-        self._configure(achievable)
-        if running:
-            self.start()
-        return self.settings
+        with self._lock:
+            achievable = self.check(want)
+            running = self._running
+            self.stop()
+            self._configure(achievable)
+            if running:
+                self.start()
+            return self.settings
 
     @final
     def start(self) -> None:
@@ -229,12 +230,18 @@ class Camera(Device):
     def poll(self) -> Frame | None:
         """The next frame if one has arrived, else ``None``; starts acquisition when needed.
 
-        A loop reads a slower camera this way without waiting. ``None`` does not count as a time-out.
+        A loop reads a slower camera this way without waiting, also while another thread configures it.
+        ``None`` does not count as a time-out.
         """
-        self.require_open()
-        self.start()
-        frame = self._poll()
-        return None if frame is None else self._register_frame(frame)
+        if not self._lock.acquire(blocking=False):
+            return None
+        try:
+            self.require_open()
+            self.start()
+            frame = self._poll()
+            return None if frame is None else self._register_frame(frame)
+        finally:
+            self._lock.release()
 
     def _register_frame(self, frame: Frame) -> Frame:
         if not isinstance(frame, Frame):

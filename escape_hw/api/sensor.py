@@ -129,6 +129,9 @@ class SlopeFunction(Protocol):
     ) -> NDArray[np.float32]:
         """Slopes ``(n_slopes,)``, in ``out`` if given; ``flux (n_valid,)`` is filled when given."""
 
+    def shift_references(self, offset: NDArray[np.float32]) -> None:
+        """Add an offset ``(n_slopes,)`` to the reference slopes."""
+
 
 @renamed_members(air_px="turbulence_px")
 @dataclass(frozen=True, slots=True, eq=False)

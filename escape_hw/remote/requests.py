@@ -170,9 +170,65 @@ class SetRecording(Request):
     seconds: Annotated[float, Field(gt=0, le=86_400, allow_inf_nan=False)] | None = None
 
 
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Pixel = Annotated[int, Field(ge=0, le=100_000)]
+
+
+class CameraRequest(Request):
+    """Settings of a camera; absent ones stay.
+
+    ``check_camera`` changes nothing. Both are answered with :class:`~escape_hw.remote.state.CameraPlan`.
+    """
+
+    verb: Literal["check_camera", "set_camera"]
+    camera: Literal["wfs", "science"]
+    exposure_s: Positive | None = None
+    frame_rate_hz: Positive | None = None
+    gain_db: Annotated[float, Field(allow_inf_nan=False)] | None = None
+    #: x, y, width, height.
+    region: tuple[Pixel, Pixel, Pixel, Pixel] | None = None
+
+
+#: Longest time for which a poke is held, seconds.
+LONGEST_POKE_S = 30.0
+
+
+class PokeRequest(Request):
+    """Poke one actuator or mode of an idle bench; the mirror returns to flat by itself.
+
+    ``check_poke`` moves nothing. It is answered with :class:`~escape_hw.remote.state.PokePlan`, ``poke`` with
+    ``null`` when the poke has begun.
+    """
+
+    verb: Literal["check_poke", "poke"]
+    kind: Literal["actuator", "mode"]
+    number: Annotated[int, Field(ge=0)]
+    #: Command of the actuator, or of the actuator that the mode moves most, as fraction of full stroke.
+    amplitude: Annotated[float, Field(ge=-1, le=1, allow_inf_nan=False)]
+    seconds: Annotated[float, Field(ge=0.1, le=LONGEST_POKE_S, allow_inf_nan=False)] = 2.0
+
+
+class OffsetsRequest(Request):
+    """Set, save or load the offsets; answered with :class:`~escape_hw.remote.state.OffsetsState`.
+
+    ``set_offsets``
+        ``terms`` replace all terms, nm rms wavefront by name. ``references`` and ``flat``: keep them, clear
+        them, or use the mean of the present slopes and the present shape of the mirror.
+    ``save_offsets``, ``load_offsets``
+        By ``name``.
+    """
+
+    verb: Literal["set_offsets", "save_offsets", "load_offsets"]
+    terms: dict[Name, Annotated[float, Field(ge=-1e5, le=1e5, allow_inf_nan=False)]] | None = None
+    references: Literal["keep", "clear", "present"] = "keep"
+    flat: Literal["keep", "clear", "present"] = "keep"
+    name: Name = "offsets"
+
+
 AnyRequest = Annotated[
     PlainRequest | RegisterClient | GetLog | GetNightLog | AddNote | GetLatestSample | AcquireLease
-    | ProcedureRequest | CloseLoop | SetLoop | LoadProduct | SetRecording,
+    | ProcedureRequest | CloseLoop | SetLoop | LoadProduct | SetRecording | CameraRequest
+    | PokeRequest | OffsetsRequest,
     Field(discriminator="verb"),
 ]  # fmt: skip
 
@@ -199,7 +255,8 @@ SAFETY_VERBS = frozenset({"open_loop", "flatten", "abort_procedure"})
 #: Requests that need the lease.
 LEASE_VERBS = frozenset({
     "start_procedure", "pause_procedure", "resume_procedure", "close_loop", "set_loop", "load_product",
-    "set_recording", "clear_fault", "shutdown",
+    "set_recording", "clear_fault", "shutdown", "set_camera", "poke",
+    "set_offsets", "save_offsets", "load_offsets",
 })  # fmt: skip
 #: Requests that change the state.
 STATE_CHANGING_VERBS = SAFETY_VERBS | LEASE_VERBS - {"shutdown"} | {"acquire_lease", "release_lease"}

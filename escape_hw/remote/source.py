@@ -54,7 +54,7 @@ STREAMS: dict[str, str] = {
     "slopes": "(n_slopes,), pixel",
     "residual_modes": "reconstructed residual (n_modes,), nm rms wavefront; closed loop only",
     "commands": "command of the mirror (n_act,), fraction of full stroke",
-    "psf": "science frame (rows, columns), counts",
+    "psf": "science frame (rows, columns), counts; meta 'full_scale': saturation",
     # on change
     "model_psf": "reference PSF of the Strehl ratio (rows, columns), scale of 'psf'",
     "latency_histogram": "counts in the bins of streams.timing (2, bins): latency, frame interval",

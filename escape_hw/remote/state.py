@@ -218,6 +218,18 @@ class ProductEntry(StateDocument):
     summary: str = ""
 
 
+class OffsetsState(StateDocument):
+    """Offsets of the mirror and of the loop's reference slopes."""
+
+    #: nm rms wavefront by name: ``tip``, ``tilt``, ``focus``, ``mode 12``.
+    terms: dict[str, float] = Field(default_factory=dict)
+    #: Whether reference slopes were measured, and whether there is a flat other than zeros.
+    references: bool = False
+    flat: bool = False
+    #: Offsets saved on the server, by name.
+    saved: tuple[str, ...] = ()
+
+
 class RecordingState(StateDocument):
     """Recording of telemetry at full rate; numbers of entries."""
 
@@ -274,6 +286,7 @@ class State(StateDocument):
     last_run: FinishedRun | None = None
     products: tuple[ProductEntry, ...] = ()
     recording: RecordingState = RecordingState()
+    offsets: OffsetsState = OffsetsState()
     disk: DiskState = DiskState()
     streams: tuple[StreamEntry, ...] = ()
     #: Increases whenever the sensor's geometry changes.
@@ -333,6 +346,46 @@ class Geometry(StateDocument):
     #: Sub-aperture or pupil outlines on the camera: (x, y, half width) in pixels each.
     outlines_px: tuple[tuple[float, float, float], ...] = ()
     n_modes: int = 0
+    #: Metres of surface for a command of 1, and lambda/D in pixels of the science camera; 0 if unknown.
+    stroke_m: float = 0.0
+    psf_px: float = 0.0
+
+
+class CameraValues(StateDocument):
+    """Settings of a camera."""
+
+    exposure_s: float
+    frame_rate_hz: float
+    gain_db: float
+    #: x, y, width, height, pixels.
+    region: tuple[int, int, int, int]
+
+
+class CameraPlan(StateDocument):
+    """What other settings of a camera would change."""
+
+    camera: str
+    #: Settings in force, and the nearest to the requested ones that the camera can do.
+    current: CameraValues
+    planned: CameraValues
+    #: The differences in words, and what they discard.
+    changes: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+    #: Why they cannot be applied now; empty if they can.
+    refusal: str = ""
+
+
+class PokePlan(StateDocument):
+    """What a poke of one actuator or mode would do."""
+
+    description: str
+    #: Largest command of an actuator, as fraction of full stroke and in nanometres of surface; the latter is
+    #: 0 where the stroke is not known.
+    peak: float
+    peak_nm: float = 0.0
+    #: Largest amplitude that the limits of the mirror allow, and why the poke is not possible now.
+    allowed: float
+    refusal: str = ""
 
 
 #: Arguments of a procedure by name.

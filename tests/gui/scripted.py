@@ -14,6 +14,8 @@ from escape_hw.io.night_log import NightEntry
 from escape_hw.remote.source import Sample
 from escape_hw.remote.state import (
     Arguments,
+    CameraPlan,
+    CameraValues,
     DeviceHealth,
     DeviceState,
     DiskState,
@@ -26,7 +28,9 @@ from escape_hw.remote.state import (
     LogLine,
     LoopState,
     MirrorState,
+    OffsetsState,
     Phase,
+    PokePlan,
     ProcedureEntry,
     ProcedurePlan,
     ProductEntry,
@@ -84,7 +88,14 @@ def shack_hartmann(n: int = 24, pitch: float = 15.54) -> Geometry:
     half = 0.5 * pitch
     places = [(14 + (c + 0.5) * pitch, 14 + (r + 0.5) * pitch) for r, c in zip(rows, columns, strict=True)]
     outlines = tuple((x, y, half) for x, y in places)
-    return Geometry(valid=rows_of(valid), layout=rows_of(disc(11, 1.03)), outlines_px=outlines, n_modes=94)
+    return Geometry(
+        valid=rows_of(valid),
+        layout=rows_of(disc(11, 1.03)),
+        outlines_px=outlines,
+        n_modes=94,
+        stroke_m=3.5e-6,
+        psf_px=2.46,
+    )
 
 
 def secondary() -> Geometry:
@@ -271,6 +282,63 @@ class ScriptedControl:
         if verb.startswith("_"):
             raise AttributeError(verb)
         return lambda *args, **kwargs: self._note(verb, **({"args": args} if args else {}), **kwargs)
+
+    #: Settings of both cameras.
+    camera = CameraValues(exposure_s=1.9e-3, frame_rate_hz=500.0, gain_db=0.0, region=(0, 0, 400, 400))
+    #: Why the camera cannot be changed, and the mirror not be poked.
+    refusal = ""
+
+    def check_camera(self, camera: str, **settings: Any) -> CameraPlan:
+        """What the settings would change."""
+        self._note("check_camera", camera=camera, **settings)
+        planned = self.camera.model_copy(update=settings)
+        changes = tuple(f"{name} → {value}" for name, value in settings.items())
+        return CameraPlan(
+            camera=camera, current=self.camera, planned=planned, changes=changes, refusal=self.refusal
+        )
+
+    def set_camera(self, camera: str, **settings: Any) -> CameraPlan:
+        """Change the settings."""
+        plan = self.check_camera(camera, **settings)
+        self.asked[-1] = ("set_camera", self.asked[-1][1])
+        self.camera = plan.planned
+        return plan
+
+    #: Offsets, and those that are saved.
+    offsets = OffsetsState(saved=("night-1",))
+
+    def set_offsets(self, terms: Mapping[str, float] | None = None, **more: str) -> OffsetsState:
+        """Set the offsets."""
+        self._note("set_offsets", terms=terms, **more)
+        references, flat = more.get("references"), more.get("flat")
+        self.offsets = self.offsets.model_copy(
+            update={
+                **({} if terms is None else {"terms": dict(terms)}),
+                **({} if references == "keep" else {"references": references == "present"}),
+                **({} if flat == "keep" else {"flat": flat == "present"}),
+            }
+        )
+        return self.offsets
+
+    def save_offsets(self, name: str) -> OffsetsState:
+        """Save the offsets."""
+        self._note("save_offsets", name=name)
+        self.offsets = self.offsets.model_copy(update={"saved": (*self.offsets.saved, name)})
+        return self.offsets
+
+    def load_offsets(self, name: str) -> OffsetsState:
+        """Restore offsets."""
+        self._note("load_offsets", name=name)
+        self.offsets = self.offsets.model_copy(update={"terms": {"focus": 60.0, "mode 4": -20.0}})
+        return self.offsets
+
+    def check_poke(self, kind: str, number: int, amplitude: float, seconds: float) -> PokePlan:
+        """What a poke would do."""
+        self._note("check_poke", kind=kind, number=number, amplitude=amplitude, seconds=seconds)
+        return PokePlan(
+            description=f"{kind} {number + 1} at {amplitude:+g}", peak=abs(amplitude), peak_nm=150.0,
+            allowed=0.4, refusal=self.refusal,
+        )  # fmt: skip
 
     def plan(self, procedure: str, arguments: Arguments) -> ProcedurePlan:
         """A plan."""

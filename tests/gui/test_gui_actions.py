@@ -109,6 +109,7 @@ CHECKS: dict[str, Callable[[Stage], None]] = {
     "take_control": lambda s: s.asked("acquire", take_over=True),
     "give_back": lambda s: s.asked("release"),
     "record": lambda s: s.asked("record", args=(True,)),
+    "connect": lambda s: _is(s.window.connect_dialog.isVisible()),
     "alarms": lambda s: _is(s.window.alarm_dialog.isVisible()),
     "acknowledge": lambda s: _is(s.window.alarms.unacknowledged == ()),
     "clear_fault": lambda s: s.asked("clear_fault"),
@@ -146,6 +147,9 @@ def test_every_action_does_what_it_says(
     monkeypatch.setattr(QFileDialog, "getSaveFileName", lambda *_: (str(folder / f"chosen.{ending}"), ""))
     monkeypatch.setattr(QFileDialog, "getOpenFileName", lambda *_: (str(folder / "chosen.fits"), ""))
     monkeypatch.setattr(QFileDialog, "getExistingDirectory", lambda *_: str(folder))
+    (tmp_path / "run").mkdir(mode=0o700)
+    for variable in ("XDG_RUNTIME_DIR", "XDG_CONFIG_HOME"):
+        monkeypatch.setenv(variable, str(tmp_path / "run"))
     SETTINGS.get(action.name, lambda _: None)(source)
     if action.name == "reset_layout":
         window.docks["log"].close()

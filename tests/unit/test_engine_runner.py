@@ -45,7 +45,7 @@ class Owner:
     def __init__(self) -> None:
         config = SimpleNamespace(system=SimpleNamespace(name="small"), to_toml=str)
         self.bench = SimpleNamespace(wfs=self, config=config, simulated=True)
-        self.state = idle_state()
+        self.config, self.state = config, idle_state()
         self.publisher = SimpleNamespace(reset_residual=lambda: None)
         self.state_publisher = SimpleNamespace(publish=lambda: None)
         self.sent: list[Any] = []
@@ -80,7 +80,7 @@ def owner(monkeypatch: pytest.MonkeyPatch) -> Owner:
 
 def procedure_runner(owner: Any, runs: Path) -> ProcedureRunner:
     loop_runner = LoopRunner(owner, STORE)
-    return ProcedureRunner(owner, loop_runner, STORE, config_text="", runs=runs)
+    return ProcedureRunner(owner, loop_runner, STORE, runs=runs)
 
 
 def finished(run: int) -> FinishedRun:

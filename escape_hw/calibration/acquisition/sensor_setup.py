@@ -318,8 +318,17 @@ def ensure_sensor_ready(
     return setup.grid, setup.mean_frame
 
 
-def measure_dark(bench: Bench, *, frames: int = 100) -> Procedure[NDArray[np.float32]]:
+def measure_dark(
+    bench: Bench, *, frames: int = 100, blocked_by_hand: bool = False
+) -> Procedure[NDArray[np.float32]]:
     """Measure the mean dark frame with the beam stop in, and set it as ``bench.dark``.
+
+    Parameters
+    ----------
+    frames
+        Frames to average.
+    blocked_by_hand
+        The beam is blocked already; needed where the beam stop is not under remote control.
 
     Returns
     -------
@@ -331,13 +340,17 @@ def measure_dark(bench: Bench, *, frames: int = 100) -> Procedure[NDArray[np.flo
     ConfigError
         The number of frames is not at least 1.
     CalibrationError
-        The system has no beam stop under remote control.
+        The system has no beam stop under remote control, and the beam was not blocked by hand.
     """
+    validate_frame_count(frames)
+    if blocked_by_hand:
+        bench.dark = yield from _average_frames(bench, frames, "dark frame")
+        return bench.dark
     if bench.screen is None:
         raise CalibrationError(
-            "this system has no beam stop under remote control; block the beam by hand and set bench.dark"
+            "this system has no beam stop under remote control; block the beam by hand and say so "
+            "(blocked_by_hand), or set bench.dark"
         )
-    validate_frame_count(frames)
     before = bench.screen.state.blocked
     bench.screen.set(blocked=True)
     try:
@@ -348,3 +361,53 @@ def measure_dark(bench: Bench, *, frames: int = 100) -> Procedure[NDArray[np.flo
     finally:
         bench.screen.set(blocked=before)
     return bench.dark
+
+
+#: Range of the relative response of a working pixel, and largest share of pixels outside of it in a flat.
+_PIXEL_RESPONSE, _MAX_DEFECTIVE_SHARE = (0.5, 1.5), 0.01
+
+
+def compute_flat(mean_frame: NDArray[np.float32], dark: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Relative response of the pixels ``(rows, columns)``, mean 1, from a mean frame in uniform light.
+
+    Pixels whose response is less than half or more than 1.5 times the mean count as defective and get 1.
+
+    Raises
+    ------
+    CalibrationError
+        There is no light above the dark frame, or it is not uniform: more than 1 % of the pixels differ from
+        the mean by more than half of it.
+    """
+    light = mean_frame.astype(np.float64) - dark
+    level = float(np.median(light))
+    if level <= 0:
+        raise CalibrationError("no light above the dark frame; illuminate the whole camera uniformly")
+    response = light / level
+    low, high = _PIXEL_RESPONSE
+    defective = (response < low) | (response > high)
+    share = float(defective.mean())
+    if share > _MAX_DEFECTIVE_SHARE:
+        raise CalibrationError(
+            f"{100 * share:.1f} % of the pixels differ from the mean by more than half of it; a flat needs "
+            "uniform light on the whole camera"
+        )
+    response[defective] = 1.0
+    return np.asarray(response / response.mean(), np.float32)
+
+
+def measure_flat(bench: Bench, *, frames: int = 100) -> Procedure[NDArray[np.float32]]:
+    """Measure the relative response of the pixels in uniform light, and set it as ``bench.flat``.
+
+    Raises
+    ------
+    ConfigError
+        The number of frames is not at least 1.
+    CalibrationError
+        There is no dark frame, or see :func:`compute_flat`.
+    """
+    validate_frame_count(frames)
+    if bench.dark is None:
+        raise CalibrationError("there is no dark frame; measure it first")
+    mean = yield from _average_frames(bench, frames, "flat")
+    bench.flat = compute_flat(mean, bench.dark)
+    return bench.flat

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from escape_hw.api.interaction_matrix import InteractionMatrix
+from escape_hw.api.offsets import Offsets
 from escape_hw.api.results import CalibrationResult
 from escape_hw.api.sensor import SensorGeometry, SlopeFunction
 from escape_hw.bench import Bench
@@ -67,14 +68,18 @@ def build_integrator(
     return LeakyIntegrator(invert_matrix(matrix, dropped), gain, leak)
 
 
+NO_OFFSETS = Offsets()
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class LoopSettings:
-    """Settings of a loop: calibration with the matrix that closes it, gain, leak and dropped modes."""
+    """Settings of a loop: calibration with the matrix that closes it, gain, leak, dropped modes, offsets."""
 
     calibration: CalibrationResult
     gain: float
     leak: float
     dropped_modes: int
+    offsets: Offsets = NO_OFFSETS
 
     def with_changes(self, **changes: Any) -> LoopSettings:
         """The settings with changes; those that are ``None`` do not count."""
@@ -114,12 +119,15 @@ class LoopControl:
         gain: float | None = None,
         leak: float | None = None,
         dropped_modes: int | None = None,
+        offsets: Offsets | None = None,
     ) -> None:
         c = bench.config.loop
         self._bench, self._lock = bench, threading.Lock()
         self._open_requested = False
         configured = LoopSettings(calibration, c.gain, c.leak, c.dropped_modes)
-        self._requested = configured.with_changes(gain=gain, leak=leak, dropped_modes=dropped_modes)
+        self._requested = configured.with_changes(
+            gain=gain, leak=leak, dropped_modes=dropped_modes, offsets=offsets
+        )
         self._pending: LoopChange | None = self._prepare(self._requested)
 
     @property
@@ -139,6 +147,7 @@ class LoopControl:
         gain: float | None = None,
         leak: float | None = None,
         dropped_modes: int | None = None,
+        offsets: Offsets | None = None,
     ) -> LoopSettings:
         """Request other settings; ``None`` leaves a setting as it is. Returns all requested settings.
 
@@ -153,7 +162,7 @@ class LoopControl:
         with self._lock:
             now = self._requested
             requested = now.with_changes(
-                calibration=calibration, gain=gain, leak=leak, dropped_modes=dropped_modes
+                calibration=calibration, gain=gain, leak=leak, dropped_modes=dropped_modes, offsets=offsets
             )
             _require_exchangeable(now.calibration, requested.calibration)
             self._pending = self._prepare(requested)
@@ -179,7 +188,11 @@ class LoopControl:
             gain=requested.gain, leak=requested.leak, dropped_modes=requested.dropped_modes,
         )  # fmt: skip
         undriven = _undriven_modes(control.reconstructor, requested.dropped_modes)
-        return LoopChange(requested, control, build_slope_function(self._bench, grid), undriven)
+        slopes_of = build_slope_function(self._bench, grid)
+        offset = requested.offsets.reference_slopes(matrix)
+        if offset.any():
+            slopes_of.shift_references(offset)
+        return LoopChange(requested, control, slopes_of, undriven)
 
 
 def _undriven_modes(reconstructor: NDArray[np.float32], dropped_modes: int) -> NDArray[np.float32]:

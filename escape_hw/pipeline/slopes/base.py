@@ -54,6 +54,8 @@ class FrameSlopes(abc.ABC, Generic[G]):
         self._gain = np.ascontiguousarray(1 / response)
         self._offset = np.ascontiguousarray(self.dark * self._gain + np.float32(threshold))
         self._light = np.empty(grid.n_valid, np.float32)
+        #: Subtracted from the slopes ``(n_slopes,)``; set by the subclass.
+        self._zero_points = np.zeros(grid.n_slopes, np.float32)
         #: Called with the slopes of each frame.
         self.observer: Callable[[NDArray[np.float32]], object] | None = None
 
@@ -79,6 +81,10 @@ class FrameSlopes(abc.ABC, Generic[G]):
         if self.observer is not None:
             self.observer(slopes)
         return slopes
+
+    def shift_references(self, offset: NDArray[np.float32]) -> None:
+        """Add an offset ``(n_slopes,)`` to the reference slopes."""
+        self._zero_points += np.asarray(offset, np.float32)
 
     @abc.abstractmethod
     def _compute(

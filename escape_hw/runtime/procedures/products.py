@@ -69,8 +69,9 @@ def save_values(
     values: Mapping[str, Any],
     wall_seconds: float,
 ) -> SavedRun:
-    """Save a result that consists of a few numbers, by their names, without products and report."""
-    content = {**values, "partial": False, "products": {}, "verdict": None}
+    """Save a result that consists of a few numbers, by their names, without report."""
+    products = {name: str(path) for name, path in folder.products.items()}
+    content = {**values, "partial": False, "products": products, "verdict": None}
     document = _document(record, name, title, wall_seconds, content)
     folder.write_result(document)
     return SavedRun({**document, **folder.location_fields()})

@@ -13,6 +13,7 @@ from escape_hw.runtime.procedures.calibration import (
     PushPullProcedure,
 )
 from escape_hw.runtime.procedures.declaration import ProcedureSpec
+from escape_hw.runtime.procedures.detector import DarkProcedure, FlatProcedure
 from escape_hw.runtime.procedures.gains import GainsProcedure
 from escape_hw.runtime.procedures.loop import LoopProcedure
 from escape_hw.runtime.procedures.model_psf import ModelPsfProcedure
@@ -33,6 +34,8 @@ PROCEDURES: list[type[ProcedureSpec[Any]]] = [
     TrackProcedure,
     SensorProcedure,
     ModelPsfProcedure,
+    DarkProcedure,
+    FlatProcedure,
 ]
 
 

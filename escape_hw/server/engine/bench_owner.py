@@ -45,11 +45,14 @@ class BenchOwner:
         send: Callable[[Mapping[str, Any]], object],
     ) -> None:
         self.bench, self.state, self.publisher = bench, state, publisher
+        #: The configuration outside procedures, with the present settings of the cameras.
+        self.config, self.config_changed = bench.config, False
         self.state_publisher, self.send = state_publisher, send
         self._jobs: SimpleQueue[Callable[[], object]] = SimpleQueue()
         self._flat_replies: list[Callable[[object], object]] = []
         self._flat_replies_lock = threading.Lock()
-        self._slopes: tuple[object, SlopeFunction | None] = (None, None)
+        #: Slope function while nothing runs, and what it was built from.
+        self._slopes: tuple[tuple[object, ...], SlopeFunction | None] = ((), None)
 
     # ------------------------------------------------------------ any thread
     def post(self, job: Callable[[], object]) -> None:
@@ -74,7 +77,7 @@ class BenchOwner:
         try:
             job = self._jobs.get(timeout=1 / IDLE_FRAME_RATE_HZ)
         except Empty:
-            self._read_idle_frame()
+            self.read_idle_frame()
             return
         try:
             job()
@@ -86,7 +89,7 @@ class BenchOwner:
         log.error("unexpected exception", exc_info=error)
         self.make_safe(f"{type(error).__name__}: {error} (this is a defect of ESCAPE)", "See the log.")
 
-    def _read_idle_frame(self) -> None:
+    def read_idle_frame(self) -> None:
         """Read a frame, and compute its slopes when the sensor's geometry is known."""
         bench = self.bench
         if not bench.wfs.is_open:
@@ -105,8 +108,9 @@ class BenchOwner:
             return
         grid = self.publisher.grid
         if grid is not None:
-            if self._slopes[0] is not grid:
-                self._slopes = (grid, build_slope_function(bench, grid))
+            parts = (grid, bench.dark, bench.flat)
+            if list(map(id, self._slopes[0])) != list(map(id, parts)):
+                self._slopes = (parts, build_slope_function(bench, grid))
             if self._slopes[1] is not None:
                 self._slopes[1](frame.data)
 
@@ -117,7 +121,9 @@ class BenchOwner:
         bench = self.bench
         try:
             bench.open()
-            self.publisher.set_full_scale(bench.wfs.info.full_scale)
+            self._restore_camera_settings()
+            science = None if bench.science is None else bench.science.info.full_scale
+            self.publisher.set_full_scale(bench.wfs.info.full_scale, science)
             bench.callbacks = self.publisher.callbacks
             bench.dm.flatten()
         except EscapeError as error:
@@ -125,6 +131,14 @@ class BenchOwner:
             return
         self.state.set_phase(Phase.IDLE)
         log.info("%s: %d devices open, mirror flat", bench.config.system.name, len(bench.devices))
+
+    def _restore_camera_settings(self) -> None:
+        """Apply the settings that were chosen before the devices were closed."""
+        for camera, section in (
+            (self.bench.wfs, self.config.devices.wfs), (self.bench.science, self.config.devices.science),
+        ):  # fmt: skip
+            if self.config_changed and camera is not None and section is not None:
+                camera.configure(section.settings())
 
     def close(self) -> None:
         """Close the devices; the mirror is flat then.

@@ -15,6 +15,7 @@ from escape_hw.io.run_folder import last_run_number
 from escape_hw.remote.state import State
 from escape_hw.runtime.session.system import System
 from escape_hw.server.engine.bench_owner import BenchOwner
+from escape_hw.server.engine.offsets import OffsetControl
 from escape_hw.server.engine.product_store import ProductStore
 from escape_hw.server.engine.publisher import StreamPublisher, TelemetryRecording
 from escape_hw.server.engine.request_handler import RequestHandler
@@ -48,12 +49,12 @@ class Engine:
             bench, state, publisher, store, setup.runs, self._send_state, recording.state
         )
         owner = self._owner = BenchOwner(bench, state, publisher, state_publisher, channel.post)
-        loop_runner = LoopRunner(owner, store)
-        procedure_runner = ProcedureRunner(
-            owner, loop_runner, store, config_text=setup.config_text, runs=setup.runs
-        )
+        offsets = OffsetControl(owner, setup.runs)
+        state_publisher.offsets = lambda: offsets.state
+        loop_runner = LoopRunner(owner, store, lambda: offsets.offsets)
+        procedure_runner = ProcedureRunner(owner, loop_runner, store, runs=setup.runs)
         self._request_handler = RequestHandler(
-            owner, loop_runner, procedure_runner, store, recording, self.request_stop
+            owner, loop_runner, procedure_runner, store, recording, self.request_stop, offsets
         )
 
     def request_stop(self) -> None:

@@ -59,12 +59,13 @@ class StreamPublisher:
         self.residual_nm = 0.0
         self.grid: SensorGeometry | None = None
         self.geometry_version = 0
-        self._full_scale_meta = b""
+        self._full_scale_meta = self._science_meta = b""
 
-    def set_full_scale(self, counts: float) -> None:
-        """Set the value at which a pixel of the sensor's camera is saturated; part of every frame's entry."""
+    def set_full_scale(self, counts: float, science: float | None = None) -> None:
+        """Set the values at which pixels of the cameras are saturated; part of every frame's entry."""
         # "top" is the key of version 0.1.0; version 0.3.0 removes it.
         self._full_scale_meta = json.dumps({"full_scale": counts, "top": counts}).encode()
+        self._science_meta = b"" if science is None else json.dumps({"full_scale": science}).encode()
 
     @property
     def callbacks(self) -> Callbacks:
@@ -82,8 +83,14 @@ class StreamPublisher:
             for name, ring in tuple(self._rings.items())
         )
 
-    def set_geometry(self, grid: SensorGeometry) -> None:
-        """Store the sensor's geometry."""
+    def remove_stream(self, name: str) -> None:
+        """Remove a stream whose content is no longer valid."""
+        ring = self._rings.pop(name, None)
+        if ring is not None:
+            ring.close()
+
+    def set_geometry(self, grid: SensorGeometry | None) -> None:
+        """Store the sensor's geometry; ``None`` when it is no longer valid."""
         if grid is not self.grid:
             self.grid = grid
             self.geometry_version += 1
@@ -129,7 +136,7 @@ class StreamPublisher:
         self._write("frames", frame.data, frame.index, frame.exposed_ns, self._full_scale_meta)
 
     def _science(self, frame: Frame) -> None:
-        self._write("psf", frame.data, frame.index, frame.exposed_ns)
+        self._write("psf", frame.data, frame.index, frame.exposed_ns, self._science_meta)
 
     def _slopes(self, index: int, slopes: NDArray[np.float32]) -> None:
         self._write("slopes", slopes, index)

@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterable, Mapping
+from functools import partial
 from typing import Any
 
 from pydantic import ValidationError
 
-from escape_hw.errors import ConfigError, RequestRefused
+from escape_hw.errors import ConfigError, DeviceError, EscapeError, RequestRefused, SettingRejected
 from escape_hw.remote import requests
 from escape_hw.remote.requests import error_to_document
-from escape_hw.server.engine.bench_owner import BenchOwner
+from escape_hw.remote.state import OffsetsState
+from escape_hw.server.engine.bench_owner import REOPEN_REMEDY, BenchOwner
+from escape_hw.server.engine.camera_settings import CameraControl
+from escape_hw.server.engine.offsets import OffsetControl
+from escape_hw.server.engine.poke import PokeRunner
 from escape_hw.server.engine.procedures import ProcedurePlanner, ProcedureRegistry, needs_loop
 from escape_hw.server.engine.product_store import ProductStore
 from escape_hw.server.engine.publisher import TelemetryRecording
@@ -37,12 +42,15 @@ class RequestHandler:
         product_store: ProductStore,
         recording: TelemetryRecording,
         request_stop: Callable[[], object],
+        offsets: OffsetControl,
     ) -> None:
         self._owner, self._state, self._request_stop = owner, owner.state, request_stop
         self._loop_runner, self._procedure_runner = loop_runner, procedure_runner
         self._product_store, self._recording = product_store, recording
         self._procedures = ProcedureRegistry(owner.bench.config)
         self._planner = ProcedurePlanner(owner.bench)
+        self._offsets = offsets
+        self._cameras, self._poke_runner = CameraControl(owner, loop_runner), PokeRunner(owner)
 
     def run(self, messages: Iterable[Mapping[str, Any]]) -> None:
         """Handle messages until the front end closes the channel; the engine stops then."""
@@ -73,7 +81,7 @@ class RequestHandler:
         except ValidationError as error:
             self._reply(number, error=RequestRefused(f"the engine has no such request: {error}"))
         except Exception as error:
-            if not isinstance(error, (ConfigError, RequestRefused)):
+            if not isinstance(error, (ConfigError, RequestRefused, SettingRejected)):
                 log.warning("a request failed: %s: %s", type(error).__name__, error)
             self._reply(number, error=error)
         else:
@@ -107,9 +115,48 @@ class RequestHandler:
                 return self._recording.set_recording(
                     request.on, images=request.images, seconds=request.seconds
                 ).model_dump(mode="json")
+            case requests.CameraRequest(verb="check_camera"):
+                return self._cameras.plan(request).model_dump(mode="json")
+            case requests.CameraRequest():
+                return self._set_camera(request, number)
+            case requests.PokeRequest(verb="check_poke"):
+                return self._poke_runner.plan(request).model_dump(mode="json")
+            case requests.PokeRequest():
+                self._poke_runner.start(request, lambda error: self._reply(number, error=error))
+                return DEFERRED
+            case requests.OffsetsRequest():
+                self._offsets.handle(request, partial(self._reply_offsets, number))
+                return DEFERRED
             case _:
                 raise RequestRefused(f"the engine has no request '{request.verb}'")
         return None
+
+    def _reply_offsets(self, number: int, state: OffsetsState | None, error: EscapeError | None) -> None:
+        if state is not None:
+            self._owner.state_publisher.publish()
+        self._reply(number, None if state is None else state.model_dump(mode="json"), error)
+
+    def _set_camera(self, request: requests.CameraRequest, number: int) -> object:
+        """Change a camera in the main thread, or the science camera of a closed loop at once."""
+        if self._cameras.is_science_in_loop(request):
+            return self._cameras.change(request).model_dump(mode="json")
+        plan = self._cameras.plan(request)
+        if plan.refusal:
+            raise RequestRefused(plan.refusal)
+
+        def change() -> None:
+            try:
+                answer = self._cameras.change(request).model_dump(mode="json")
+            except EscapeError as error:
+                if isinstance(error, DeviceError) and not isinstance(error, SettingRejected):
+                    self._owner.make_safe(str(error), REOPEN_REMEDY)
+                self._reply(number, error=error)
+                return
+            self._owner.state_publisher.publish()
+            self._reply(number, answer)
+
+        self._owner.post(change)
+        return DEFERRED
 
     def _answer_plain(self, verb: str, number: int) -> object:
         state = self._state

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from escape_hw.api.concurrency import SignalSafeFlag
+from escape_hw.api.offsets import Offsets
 from escape_hw.api.procedure import run as run_procedure
 from escape_hw.calibration.loop.control import LoopControl
 from escape_hw.calibration.loop.operation import run_until_opened
@@ -41,10 +42,11 @@ OnClosed = Callable[[EscapeError | None], object]
 class LoopRunner:
     """Closes the loop and changes its parameters."""
 
-    def __init__(self, owner: BenchOwner, product_store: ProductStore) -> None:
+    def __init__(
+        self, owner: BenchOwner, product_store: ProductStore, offsets: Callable[[], Offsets] = Offsets
+    ) -> None:
         self._owner, self._bench, self._state = owner, owner.bench, owner.state
-        #: A procedure replaces the bench's configuration while it runs.
-        self._config = owner.bench.config
+        self._offsets = offsets
         self._product_store = product_store
         #: PSF without turbulence ``(rows, columns)``, once measured; the running Strehl ratio needs it.
         self.model_psf: NDArray[np.float32] | None = None
@@ -59,6 +61,7 @@ class LoopRunner:
         control = LoopControl(
             self._bench, self._load_matrix(settings.matrix).result,
             gain=settings.gain, leak=settings.leak, dropped_modes=settings.dropped_modes,
+            offsets=self._offsets(),
         )  # fmt: skip
         return settings, control
 
@@ -104,7 +107,7 @@ class LoopRunner:
     def _load_matrix(self, name: str) -> MatrixProduct:
         # Real drivers may be connected to simulated libraries: the open devices decide what is a simulation.
         product = load_fitting_matrix(
-            self._product_store.matrix_path(name), self._config, self._bench.simulated
+            self._product_store.matrix_path(name), self._owner.config, self._bench.simulated
         )
         require_hardware_matrix(product, self._bench, force=False)
         return product
@@ -129,7 +132,7 @@ class LoopRunner:
             if end.fault:
                 # The parameters that led to the fault are not the default of the next loop.
                 matrix = state.snapshot.loop.matrix
-                state.set_loop_settings(LoopParameters.from_config(self._config, matrix))
+                state.set_loop_settings(LoopParameters.from_config(self._owner.config, matrix))
                 self._owner.make_safe(f"the loop was opened: {end.fault}", _REMEDY)
         except Aborted:
             log.info("loop open, mirror flat")
@@ -158,16 +161,14 @@ class ProcedureRunner:
         loop_runner: LoopRunner,
         product_store: ProductStore,
         *,
-        config_text: str,
         runs: Path,
     ) -> None:
         self._owner, self._bench, self._state = owner, owner.bench, owner.state
-        self._loop_runner, self._product_store = loop_runner, product_store
-        self._config_text, self._runs = config_text, runs
+        self._loop_runner, self._product_store, self._runs = loop_runner, product_store, runs
 
     def start(self, task: ProcedureSpec[Any], name: str, arguments: Arguments, needs_loop: bool) -> int:
         """Load a task, reserve the engine and queue the procedure; returns the number of its run."""
-        config = load_text(self._config_text, overrides=task.overrides)
+        config = load_text(self._owner.config.to_toml(), overrides=task.overrides)
         task.load(config, self._bench.simulated)
         ticket = self._state.begin_run(name, arguments, needs_loop)
         if ticket.loop_before is not None:

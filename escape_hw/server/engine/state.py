@@ -17,6 +17,9 @@ from escape_hw.errors import RequestRefused
 from escape_hw.io.provenance import format_utc
 from escape_hw.remote.state import ActiveRun, FaultState, Finish, FinishedRun, Phase
 
+#: Number of a poke in the place of that of a run.
+POKE_ID = 0
+
 
 @dataclass(frozen=True, slots=True)
 class LoopParameters:
@@ -204,6 +207,27 @@ class EngineState:
         return RunTicket(run, self._stop, loop_before)
 
     @_atomic
+    def check_idle(self) -> None:
+        """Check that nothing runs and no fault is latched (RequestRefused)."""
+        self._require_idle()
+
+    @_atomic
+    def begin_poke(self, description: str) -> SignalSafeFlag:
+        """Reserve the engine for a poke, which is no run with a folder; returns its stop flag."""
+        self._require_idle()
+        self._stop = SignalSafeFlag()
+        poke = ActiveRun(
+            id=POKE_ID, name="poke", arguments={}, stage=description, unit="second", started_utc=format_utc()
+        )
+        self._set(active_run=poke, phase=Phase.PROCEDURE, paused=False, needs_loop=False)
+        return self._stop
+
+    @_atomic
+    def end_poke(self) -> None:
+        """The poke has ended, and the mirror is flat."""
+        self._set(active_run=None, phase=Phase.IDLE if self._now.fault is None else Phase.FAULT)
+
+    @_atomic
     def set_loop_closed(self, closed: bool) -> None:
         """Note that the loop is closed, or open."""
         self._set(loop_closed=closed)
@@ -229,6 +253,8 @@ class EngineState:
     def pause(self) -> None:
         """Ask the procedure to pause (RequestRefused: no procedure runs, or it works in closed loop)."""
         run = self._require_run()
+        if run.id == POKE_ID:
+            raise RequestRefused("a poke ends by itself and cannot be paused; abort it")
         if self._now.needs_loop:
             raise RequestRefused(f"'{run.name}' works in closed loop and cannot be paused; abort it")
         self._set(paused=True)

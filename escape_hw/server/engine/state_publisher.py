@@ -29,6 +29,7 @@ from escape_hw.remote.state import (
     LatencyState,
     LoopState,
     MirrorState,
+    OffsetsState,
     RecordingState,
     State,
 )
@@ -66,6 +67,8 @@ class StatePublisher:
         self._publisher, self._product_store = publisher, product_store
         self._runs, self._emit, self._recording = runs, emit, recording
         self._clock = clock
+        #: Offsets of mirror and loop.
+        self.offsets: Callable[[], OffsetsState] = OffsetsState
         self._emit_lock = threading.Lock()
         self._last: tuple[float, Frame | None] = (0.0, None)
         self._rate, self._lost, self._counted_frames = 0.0, 0, 0
@@ -107,7 +110,7 @@ class StatePublisher:
             rates=self._frame_counters(frame, now), mirror=self._mirror(), loop=self._loop(now),
             latency=_latency(now.loop_statistics),
             active_run=now.active_run, last_run=now.last_run, products=self._product_store.products,
-            recording=self._recording(), disk=self._disk(), streams=publisher.entries,
+            recording=self._recording(), offsets=self.offsets(), disk=self._disk(), streams=publisher.entries,
             geometry_version=publisher.geometry_version, illumination=illumination,
         )  # fmt: skip
 
@@ -177,8 +180,12 @@ def _finite_metric(metrics: Mapping[str, float], name: str) -> float | None:
 
 def device_states(bench: Bench, device_messages: Mapping[str, str]) -> tuple[DeviceState, ...]:
     """State of every device; ``device_messages`` holds their problems by name."""
+    used = {
+        name: "none" if image is None else "measured"
+        for name, image in (("dark", bench.dark), ("flat", bench.flat))
+    }
     return tuple(
-        _device(name, kind, getattr(bench, name), device_messages)
+        _device(name, kind, getattr(bench, name), device_messages, used if name == "wfs" else {})
         for name, kind in (
             ("dm", "deformable mirror"),
             ("wfs", "wavefront sensor camera"),
@@ -190,7 +197,9 @@ def device_states(bench: Bench, device_messages: Mapping[str, str]) -> tuple[Dev
     )
 
 
-def _device(name: str, kind: str, device: Device, device_messages: Mapping[str, str]) -> DeviceState:
+def _device(
+    name: str, kind: str, device: Device, device_messages: Mapping[str, str], facts: Mapping[str, str]
+) -> DeviceState:
     message = device_messages.get(name, "")
     if not device.is_open:
         health = DeviceHealth.LOST if message else DeviceHealth.CLOSED
@@ -200,7 +209,8 @@ def _device(name: str, kind: str, device: Device, device_messages: Mapping[str, 
     info = device.info  # type: ignore[attr-defined]
     return DeviceState(
         name=name, kind=kind, model=info.model, serial=info.serial, simulated=bool(info.simulated),
-        health=DeviceHealth.STALE if message else DeviceHealth.OK, facts=_facts(device), message=message,
+        health=DeviceHealth.STALE if message else DeviceHealth.OK, facts={**_facts(device), **facts},
+        message=message,
     )  # fmt: skip
 
 
@@ -221,12 +231,15 @@ def _facts(device: Device) -> dict[str, float | str]:
 def geometry_of(bench: Bench, grid: SensorGeometry | None) -> Geometry:
     """Positions of the sub-apertures and actuators."""
     valid = () if grid is None else tuple("".join("1" if one else "0" for one in row) for row in grid.valid)
+    stroke_m, science = float(bench.dm.info.stroke_m), bench.config.devices.science
     return Geometry(
         valid=valid,
         layout=actuator_layout(bench),
         positions_m=actuator_positions(bench),
         outlines_px=() if grid is None else grid.outlines(),
         n_modes=bench.config.basis.n_modes,
+        stroke_m=stroke_m if math.isfinite(stroke_m) else 0.0,
+        psf_px=0.0 if science is None else science.psf_px,
     )
 
 

@@ -1,0 +1,138 @@
+"""Display of images: stretch, colours, average, cross-sections, width of the PSF; with clicks and keys."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from PySide6.QtCore import QPoint, Qt
+from PySide6.QtTest import QTest
+from PySide6.QtWidgets import QApplication
+from pytestqt.qtbot import QtBot
+from scripted import ScriptedSource
+
+from escape_gui.main_window import MainWindow
+from escape_gui.panels.camera import CameraPanel
+from escape_gui.panels.psf import PsfPanel
+from escape_gui.views.images import FrameAverage
+from escape_gui.widgets.images import ImageToolbar, ImageViewer
+
+MakeWindow = Callable[..., MainWindow]
+
+
+def click_pixel(view: ImageViewer, x: int, y: int, *, twice: bool = False) -> None:
+    """Click the middle of a pixel."""
+    place = view.view.mapFromScene(view.image.mapToScene(x + 0.5, y + 0.5))
+    press = QTest.mouseDClick if twice else QTest.mouseClick
+    press(view.view.viewport(), Qt.MouseButton.LeftButton, pos=QPoint(place.x(), place.y()))
+    QApplication.processEvents()
+
+
+def choose(bar: ImageToolbar, kind: str, value: object, qtbot: QtBot) -> None:
+    """Open the menu and click an entry."""
+    action = bar.choices[kind, value]
+    bar.menu.popup(bar.mapToGlobal(QPoint(0, 0)))
+    place = bar.menu.actionGeometry(action).center()
+    qtbot.mouseClick(bar.menu, Qt.MouseButton.LeftButton, pos=place)
+    bar.menu.close()
+
+
+def test_stretches_and_colours_are_chosen_in_the_menu_and_with_keys(
+    make_window: MakeWindow, qtbot: QtBot
+) -> None:
+    camera = make_window((CameraPanel,)).panels["camera"]
+    assert isinstance(camera, CameraPanel)
+    view, bar = camera.image_view, camera.bars[0]
+    frame = np.arange(1600, dtype=np.uint16).reshape(40, 40)
+    view.show_array(frame)
+    assert bar.display_button.text() == "percentile"
+    assert view.levels == pytest.approx(np.percentile(frame, (1, 99.7)))
+    choose(bar, "stretch", "linear", qtbot)
+    assert bar.display_button.text() == "linear"
+    assert view.levels == (0, 1599)
+    choose(bar, "stretch", "square root", qtbot)
+    assert view.levels[1] == pytest.approx(np.sqrt(1599 - np.percentile(frame, 1)), rel=1e-3)
+    view.setFocus()
+    QTest.keyClick(view, Qt.Key.Key_L)
+    assert bar.display_button.text() == "log"
+    assert view.levels == pytest.approx((np.log10(16), np.log10(1599)), abs=0.01)
+    assert bar.choices["stretch", "log"].isChecked()
+    choose(bar, "colour map", 2, qtbot)
+    assert view.colour_map == 2
+    QTest.keyClick(view, Qt.Key.Key_M)
+    assert bar.choices["colour map", 3].isChecked()
+
+
+def test_frames_are_averaged(make_window: MakeWindow, source: ScriptedSource, qtbot: QtBot) -> None:
+    window = make_window((CameraPanel,))
+    camera = window.panels["camera"]
+    assert isinstance(camera, CameraPanel)
+    choose(camera.bars[0], "average", 16, qtbot)
+    rng = np.random.default_rng(0)
+    for _ in range(40):
+        source.push("frames", rng.poisson(100, (30, 30)).astype(np.uint16), full_scale=1023.0)
+        window.update_timer.tick(force=True)
+    assert camera.image_view.data is not None
+    assert 1 < camera.image_view.data.std() < 3.5, "the noise of 16 frames is a quarter of 10 counts"
+    assert camera.bars[0].display_button.text() == "percentile, mean of 16"
+
+
+def test_the_average_starts_again_with_another_shape() -> None:
+    average = FrameAverage()
+    average.frames = 4
+    average(np.full((3, 3), 10.0))
+    assert average(np.full((3, 3), 20.0)) == pytest.approx(15.0)
+    assert average(np.full((2, 2), 7.0)) == pytest.approx(7.0)
+    average.frames = 1
+    assert average(np.full((2, 2), 9, np.uint16)).dtype == np.uint16
+
+
+def test_a_click_puts_the_cross_section_and_a_double_click_takes_it_back(
+    make_window: MakeWindow, source: ScriptedSource, qtbot: QtBot
+) -> None:
+    frame = np.add.outer(10 * np.arange(40), np.arange(40)).astype(np.uint16)
+    source.push("frames", frame, full_scale=1023.0)
+    camera = make_window((CameraPanel,)).panels["camera"]
+    assert isinstance(camera, CameraPanel)
+    qtbot.mouseClick(camera.plot_choice.buttons["section"], Qt.MouseButton.LeftButton)
+    row, column = camera.section._row, camera.section._column
+    assert camera.section.isVisible()
+    assert row.yData.tolist() == frame[39].tolist(), "at first through the brightest pixel"
+    click_pixel(camera.image_view, 5, 12)
+    assert row.yData.tolist() == frame[12].tolist()
+    assert column.yData.tolist() == frame[:, 5].tolist()
+    assert all(line.isVisible() for line in camera.image_view._section_lines)
+    click_pixel(camera.image_view, 5, 12, twice=True)
+    assert row.yData.tolist() == frame[39].tolist()
+    qtbot.mouseClick(camera.plot_choice.buttons["histogram"], Qt.MouseButton.LeftButton)
+    assert not any(line.isVisible() for line in camera.image_view._section_lines)
+
+
+def test_width_and_encircled_energy_of_the_psf(
+    make_window: MakeWindow, source: ScriptedSource, qtbot: QtBot
+) -> None:
+    y, x = np.indices((64, 64)) - 31.5
+    sigma = 2.0
+    image = 20 + 800 * np.exp(-(x**2 + y**2) / (2 * sigma**2))
+    source.push("psf", image.astype(np.uint16), full_scale=1023.0)
+    psf = make_window((PsfPanel,)).panels["psf"]
+    assert isinstance(psf, PsfPanel)
+    fwhm = 2.3548 * sigma
+    assert psf.shape is not None
+    assert psf.shape.fwhm == pytest.approx(fwhm, rel=0.01)
+    assert f"FWHM {psf.shape.fwhm:.2f} px ({psf.shape.fwhm / 2.46:.2f} λ/D)" in psf.shape_text.text()
+    qtbot.mouseClick(psf.choice.buttons["energy"], Qt.MouseButton.LeftButton)
+    radius, share = psf._energy_curves["psf"].getData()
+    assert np.interp(sigma * np.sqrt(2 * np.log(2)), radius, share) == pytest.approx(0.5, abs=0.03)
+    qtbot.mouseClick(psf.choice.buttons["section"], Qt.MouseButton.LeftButton)
+    assert psf.section._row.yData.max() == image.astype(np.uint16).max()
+
+
+def test_an_image_without_light_has_no_width(make_window: MakeWindow, source: ScriptedSource) -> None:
+    noise = np.random.default_rng(4).normal(50, 3, (64, 64))
+    source.push("psf", noise.astype(np.float32))
+    psf = make_window((PsfPanel,)).panels["psf"]
+    assert isinstance(psf, PsfPanel)
+    assert psf.shape is None
+    assert "no light" in psf.shape_text.text()
