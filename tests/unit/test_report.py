@@ -115,7 +115,7 @@ def test_page_shows_everything(page):
     for word in (
         "SIMULATED", "SPRINT convergence", "Stacked closed-loop PSFs", "Interaction matrices", "Sky time",
         "Residual wavefront", "last mirror command", "Mean sensor frame", "best gain", "a missed one",
-        "α SHORT", "injected", "Signal-to-noise", "Temporal response", "Configuration",
+        "α SHORT", "injected", "Signal-to-noise", "Temporal response", "Configuration", "Influence functions that",
         "&lt;script&gt;alert(1)",
     ):  # fmt: skip
         assert word in page, word

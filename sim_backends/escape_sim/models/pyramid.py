@@ -53,8 +53,8 @@ _GAIN_TREND = 0.3
 #: by ``_MIN_SLOPE_WEIGHT`` unless they are the majority.
 _MIN_RELATIVE_FLUX = 0.85
 _MIN_SLOPE_WEIGHT = 1e-3
-#: Detail of influence functions on a grid, relative to Gaussians. At equal nodes the matrix of a thin plate is
-#: wrong by 0.5 %, its derivatives by 4 %.
+#: Detail of influence functions on a grid, relative to Gaussians. At equal nodes the matrix of a thin plate
+#: is wrong by 0.5 %, its derivatives by 4 %.
 _SHARPER = 0.5
 #: Mirror shapes whose response is computed for each turbulence state.
 _N_SHAPES = 10
