@@ -118,6 +118,7 @@ def test_page_shows_everything(page):
         "α SHORT", "injected", "Signal-to-noise", "Temporal response", "Configuration",
         "&lt;script&gt;alert(1)",
         '<p class="verdict not-usable" role="status">Not usable: not met: a missed one; see the report</p>',
+        "Influence functions that SPRINT has found",
     ):  # fmt: skip
         assert word in page, word
     assert page.count("<figure>") == 12

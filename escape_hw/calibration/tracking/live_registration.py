@@ -139,6 +139,7 @@ class LiveRegistration:
         self._priors = Priors(width=scatter, mean_width=start.width.value - 1, extras=extras)
         # Small pokes hardly determine single actuators, so the corrections of the calibration are kept.
         self._actuator_corrections = start.actuator_corrections
+        self._influence_profile = start.influence_profile
         self._order, self._lags, self._response = order, lags, response
         self._basis = gain_curve_basis(template.n_modes, n_curve_coefficients)
         self._command_curves = compute_command_curves(template.m2c, self._basis)
@@ -286,6 +287,7 @@ class LiveRegistration:
                 for one in problem.extra_parameter_values(state)
             },
             repeatability_covariance=present.random_covariance[1:6, 1:6],
+            influence_profile=self._influence_profile,
         )
         unit = compute_fitted_matrix(self._model, self._start, estimate, self._template.m2c)
         gains = np.asarray((self._current_matrix * unit).sum(axis=0) / np.square(unit).sum(axis=0))
