@@ -117,8 +117,11 @@ class MixedEffectsProblem:
         # The x slopes of a column of sub-apertures share a sampling position, and the y slopes of a row.
         self.lines = np.unique(np.concatenate([cols, weighted.valid.shape[1] + rows]), return_inverse=True)[1]
         self.n_lines = int(self.lines.max()) + 1
-        self.shape = earlier.shape if earlier else InfluenceShape(model)
-        self.kept = earlier.kept if earlier and earlier.weighted is weighted else None
+        self.shape: InfluenceShape = earlier.shape if earlier else InfluenceShape(model)
+        # Derivatives that :meth:`linearise` uses as long as the fitted matrix hardly changes.
+        self.kept: tuple[_ZonalMatrices, NormalEquations] | None = None
+        if earlier and earlier.weighted is weighted:
+            self.kept = earlier.kept
         self.trends = slope_trends(model, weighted.valid)
         self.precision = np.concatenate([
             np.zeros(6), [priors.width**-2], (priors.shape_scale * self.shape.prior_sigma) ** -2.0,
@@ -203,7 +206,7 @@ class MixedEffectsProblem:
     ) -> NDArray[np.float64]:
         """The zonal matrix of a state from that of the common shape, with the derivatives of ``z``."""
         _, width, along_x, along_y = state.actuator
-        total = shaped + width * z.by_width
+        total = np.asarray(shaped + width * z.by_width)
         total += along_x * z.jacobian[0]
         total += along_y * z.jacobian[1]
         for share, difference in zip(state.variant, z.variants, strict=True):
