@@ -69,11 +69,8 @@ def zonal_sum(
     """
     if isinstance(model, SummingModel):
         return model.zonal_sum(functions)
-    (factor, *first), *others = functions
-    total = factor * model.zonal_matrix(*first)
-    for factor, registration, width in others:
-        total += factor * model.zonal_matrix(registration, width)
-    return total
+    matrices = [np.multiply(factor, model.zonal_matrix(at, width)) for factor, at, width in functions]
+    return np.asarray(sum(matrices[1:], start=matrices[0]))
 
 
 def _central_differences(

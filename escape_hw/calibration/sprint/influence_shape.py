@@ -160,29 +160,27 @@ class InfluenceShape:
         The four-fold terms and the derivatives in those of the edge actuators, a few per cent of the matrix,
         are taken from ``terms``, those of :meth:`linearise` nearby.
         """
-        n, edge = len(self._widths), 0.0 if self._edge is None else self._edge
-        profile, (edge_gain, edge_profile) = coefficients[:n], np.zeros((2, 1))
-        kept, kept_terms = coefficients[n:], terms[n:]
+        n = len(self._widths)
+        weights, kept = coefficients[:n, None] * np.ones(self._model.n_act), coefficients.copy()
+        edge_gain: NDArray[np.float64] | float = 1.0
         if self._edge is not None:
             first = n + len(_FOURFOLD_LOBES)
-            edge_gain, edge_profile = coefficients[first], coefficients[first + 2 : first + 2 + n, None]
-            also = [*range(n, first), first + 1, *range(first + 2 + n, self.n_terms)]
-            kept, kept_terms = coefficients[also], [terms[k] for k in also]
-            kept = [c * (1 + edge_gain * edge) if k < first else c for k, c in zip(also, kept, strict=True)]
-        # Weights of the functions of every width and actuator; those of the profile replace the first one.
-        weights = profile[:, None] * (1 + edge_gain * edge) + edge_profile * edge
-        nominal = self._shares[:, None] * np.ones_like(weights[0]) * (1 + edge_gain * edge)
-        weights = nominal + np.concatenate([-weights.sum(axis=0, keepdims=True), weights])
-        matrix = zonal_sum(
-            self._model,
-            [
-                (w, registration, width * relative)
-                for w, relative in zip(weights, PROFILE_WIDTHS, strict=True)
-            ],
-        )
+            edge_gain = 1 + coefficients[first] * self._edge
+            edge_profile = slice(first + 2, first + 2 + n)
+            weights = weights * edge_gain + coefficients[edge_profile, None] * self._edge
+            kept[first] = 0.0
+            kept[edge_profile] = 0.0
+        # The functions of the profile replace the first one.
+        weights = np.concatenate([-weights.sum(axis=0, keepdims=True), weights])
+        weights += self._shares[:, None] * edge_gain
+        functions = zip(weights, PROFILE_WIDTHS, strict=True)
+        matrix = zonal_sum(self._model, [(w, registration, width * relative) for w, relative in functions])
         if self._given is not None:
-            matrix = matrix + self._given.zonal_matrix(registration, width) * (1 + edge_gain * edge)
-        return _add(matrix, kept, kept_terms)
+            matrix += self._given.zonal_matrix(registration, width) * edge_gain
+        for number in np.flatnonzero(kept[n:]) + n:
+            is_fourfold = number < n + len(_FOURFOLD_LOBES)
+            matrix += kept[number] * (edge_gain * terms[number] if is_fourfold else terms[number])
+        return matrix
 
     def _outward_derivative(self, jacobian: NDArray[np.float64]) -> NDArray[np.float64]:
         """Derivative by outward positions of the actuators ``(n_slopes, n_act)``."""

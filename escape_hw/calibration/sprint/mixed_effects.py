@@ -17,6 +17,7 @@ from escape_hw.api.registration import Registration
 from escape_hw.api.results import ActuatorCorrections
 from escape_hw.api.synthetic_model import HasGainTrend, SyntheticModel
 from escape_hw.calibration.modes.derivatives import modal_matrix, zonal_jacobian
+from escape_hw.calibration.sprint.covariance import LinearisedProblem
 from escape_hw.calibration.sprint.extra_parameters import ExtraParameterModel, FittedExtraParameter
 from escape_hw.calibration.sprint.influence_shape import InfluenceShape
 from escape_hw.calibration.sprint.normal_equations import NormalEquations, Priors, normal_equations
@@ -36,6 +37,8 @@ _MIN_PRIOR_RATIO, _MAX_PRIOR_RATIO = 0.05, 3.0
 #: Relative change of the fitted matrix below which derivatives are kept: they change by about as much. With
 #: five times as much, solutions for matrices of high signal-to-noise ratio differ by their stated errors.
 _KEEP_BELOW = 0.002
+#: The same at a solution, where the stated errors follow from the derivatives.
+_SAME_BELOW = 1e-4
 #: Iterations of the empirical-Bayes fixed point, and relative change of all scatters that ends them.
 _ITERATIONS, _NEGLIGIBLE_CHANGE = 20, 0.02
 #: Zero effects that are added to the count of each group: the scatter of a few effects may be chance, and
@@ -117,8 +120,11 @@ class MixedEffectsProblem:
         # The x slopes of a column of sub-apertures share a sampling position, and the y slopes of a row.
         self.lines = np.unique(np.concatenate([cols, weighted.valid.shape[1] + rows]), return_inverse=True)[1]
         self.n_lines = int(self.lines.max()) + 1
-        self.shape = earlier.shape if earlier else InfluenceShape(model)
-        self.kept = earlier.kept if earlier and earlier.weighted is weighted else None
+        self.shape: InfluenceShape = earlier.shape if earlier else InfluenceShape(model)
+        # Derivatives that :meth:`linearise` uses as long as the fitted matrix hardly changes.
+        self.kept: tuple[_ZonalMatrices, NormalEquations] | None = None
+        if earlier and earlier.weighted is weighted:
+            self.kept = earlier.kept
         self.trends = slope_trends(model, weighted.valid)
         self.precision = np.concatenate([
             np.zeros(6), [priors.width**-2], (priors.shape_scale * self.shape.prior_sigma) ** -2.0,
@@ -203,7 +209,7 @@ class MixedEffectsProblem:
     ) -> NDArray[np.float64]:
         """The zonal matrix of a state from that of the common shape, with the derivatives of ``z``."""
         _, width, along_x, along_y = state.actuator
-        total = shaped + width * z.by_width
+        total = np.asarray(shaped + width * z.by_width)
         total += along_x * z.jacobian[0]
         total += along_y * z.jacobian[1]
         for share, difference in zip(state.variant, z.variants, strict=True):
@@ -250,6 +256,16 @@ class MixedEffectsProblem:
         )  # fmt: skip
         self.kept = z, system
         return system
+
+    def relinearise(self, state: MixedEffectsState, system: LinearisedProblem) -> LinearisedProblem:
+        """Model and derivatives about a state, of which ``system`` may have those from near it."""
+        if self.kept is not None:
+            residual = self.kept[1].residual
+            change = np.linalg.norm(system.residual - residual)
+            if change < _SAME_BELOW * np.linalg.norm(self.weighted.data - residual):
+                return system
+            self.kept = None
+        return self.linearise(state)
 
     def _update_kept(
         self, state: MixedEffectsState, z: _ZonalMatrices, system: NormalEquations

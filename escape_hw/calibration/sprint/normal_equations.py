@@ -146,7 +146,7 @@ class NormalEquations:
     def n_lines(self) -> int:
         """Number of sampling positions."""
         n_kinds, _, n_act = self.actuator_derivatives.shape
-        return len(self.inner) - self.n_common - self.trends.shape[1] - n_kinds * n_act
+        return int(len(self.inner) - self.n_common - self.trends.shape[1] - n_kinds * n_act)
 
     def _eliminate_effects(self) -> tuple[Any, NDArray[np.float64]]:
         """LU factors of the block of the effects, and its solution for their coupling with the common."""

@@ -7,7 +7,7 @@ fit is here, its problem in :mod:`~.mixed_effects`.
 from __future__ import annotations
 
 from collections.abc import Callable, Generator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TypeVar
 
 import numpy as np
@@ -154,7 +154,9 @@ def solve(
             weighted, model, context.priors, extras=context.extras, earlier=context.problem
         )
         state = state or problem.initial_state(Registration.from_array(start))
-        return (yield from _fit_mixed_effects(problem, state, context))
+        solution = yield from _fit_mixed_effects(problem, state, context)
+        # The errors follow from the derivatives at the solution itself.
+        return replace(solution, system=problem.relinearise(solution.state or state, solution.system))
     # The coarse search ignores slope weights.
     if not coarse_search or isinstance(model, HasSlopeWeights):
         steps = LeastSquaresProblem(weighted, model, rate, frozen).descend(start, n)
