@@ -162,6 +162,9 @@ class ProcedurePanel(Panel):
             self._show_ended(state.last_run)
         # Hidden during a run, to leave more room for the form.
         self._result_area.setVisible(self._ended is not None and running is None)
+        # Their width is known when they are visible.
+        for label in (self.outcome, self.verdict, self.numbers):
+            _fit_height(label)
 
     def on_sample(self, stream: str, sample: Sample) -> None:
         self._matrix[stream] = sample.data
