@@ -112,7 +112,7 @@ class LoopPanel(Panel):
         self.body.addWidget(self.close_button)
 
     def _connect_signals(self) -> None:
-        self.matrix.activated.connect(partial(self._on_edit, "matrix"))
+        self.matrix.activated.connect(lambda _: self._on_edit("matrix"))
         for name, field in self.numbers.items():
             field.edited.connect(partial(self._on_edit, name))
             field.lineEdit().returnPressed.connect(self.check)
@@ -230,6 +230,8 @@ class LoopPanel(Panel):
     def close_loop(self) -> None:
         """Close the loop with the values of the form, all of which are current or checked."""
         edit = self.edit
+        # The button of a closed loop is disabled, and would pass its focus on to any widget.
+        self.check_button.setFocus()
         self._ask(
             "close the loop",
             lambda server: server.close_loop(edit.matrix, edit.gain or None, edit.leak, edit.dropped_modes),

@@ -115,6 +115,7 @@ class ProcedurePanel(Panel):
         grid.setContentsMargins(0, 0, 0, 0)
         self.outcome, self.verdict, self.numbers = text_label(), text_label(), text_label()
         self._verdict_level = Level.NEUTRAL
+        self._result_width = 0
         self.report, self.folder = QPushButton("Open report"), QPushButton("Open folder")
         self.report.clicked.connect(lambda: self._open(self._product("report")))
         self.folder.clicked.connect(lambda: self._open(self._ended.folder if self._ended else ""))
@@ -162,6 +163,11 @@ class ProcedurePanel(Panel):
             self._show_ended(state.last_run)
         # Hidden during a run, to leave more room for the form.
         self._result_area.setVisible(self._ended is not None and running is None)
+        if self.numbers.width() != self._result_width:
+            # The width is known some time after they were shown.
+            self._result_width = self.numbers.width()
+            for label in (self.outcome, self.verdict, self.numbers):
+                _fit_height(label)
 
     def on_sample(self, stream: str, sample: Sample) -> None:
         self._matrix[stream] = sample.data
@@ -305,4 +311,7 @@ def _set_text(label: QLabel, text: str) -> None:
 
 def _fit_height(label: QLabel) -> None:
     """Set the minimum height of wrapped text; the layout of the panel ignores its height for width."""
-    label.setMinimumHeight(max(0, label.heightForWidth(label.width())) if label.text() else 0)
+    # The height for a width is never less than the minimum.
+    label.setMinimumHeight(0)
+    if label.text():
+        label.setMinimumHeight(max(0, label.heightForWidth(label.width())))

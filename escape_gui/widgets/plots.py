@@ -370,9 +370,13 @@ class _ParameterGrid(PlotGrid):
         return plot
 
 
+#: Room between two plots of a grid.
+_ROW_GAP_PX = 8
+
+
 def _fit_title(axis: pg.AxisItem) -> None:
     """Hide the title of an axis that is longer than the axis; it would overlap the next one."""
-    axis.showLabel(axis.label.boundingRect().width() <= axis.size().height())
+    axis.showLabel(axis.label.boundingRect().width() <= axis.size().height() + _ROW_GAP_PX)
 
 
 class ConvergencePlot(_ParameterGrid):

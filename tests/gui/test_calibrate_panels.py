@@ -196,6 +196,18 @@ def test_pages_change(calibrate, source):
     assert not panel._next_button.isEnabled()
 
 
+def test_a_short_result_after_a_long_one_has_no_gaps(calibrate: MainWindow, source: ScriptedSource) -> None:
+    panel = calibrate.panels["procedure"]
+    documents = (calibration_document(fake.calibration("escape", n=8, n_modes=6)), {"n_sub_apertures": 448})
+    for k, document in enumerate(documents):
+        source.change(last_run=FinishedRun(id=k, name=f"run {k}", finish=Finish.DONE, document=document))
+        for _ in range(3):
+            source.change()
+            look(calibrate)
+    assert panel.numbers.text() == "Sub-apertures: 448"
+    assert panel.numbers.height() < 2 * panel.numbers.fontMetrics().lineSpacing()
+
+
 # ---------------------------------------------------------------- keyboard
 def test_the_tab_key_goes_through_the_form_before_the_buttons(
     calibrate: MainWindow, control: ScriptedControl

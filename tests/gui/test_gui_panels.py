@@ -293,7 +293,8 @@ def test_a_missing_reference_psf_is_shown(make_window: MakeWindow, source: Scrip
     psf, performance = panel_of(window, PsfPanel), panel_of(window, PerformancePanel)
     window.docks["psf"].raise_()
     window.update_timer.tick(force=True)
-    assert "run model-psf" in psf.captions["model_psf"].text()
+    assert psf.captions["model_psf"].text() == "no reference PSF"
+    assert "'Model PSF' measures it" in psf.captions["model_psf"].toolTip()
     assert performance.readouts["strehl"].text == "–"
     assert performance.reference_missing_label.isVisible()
     source.streams["model_psf"] = model

@@ -82,6 +82,20 @@ def test_a_typed_gain_is_kept_from_the_first_key(
     assert control.asked == [("set_loop", {"gain": 0.55})]
 
 
+def test_a_matrix_is_chosen_with_the_keyboard(
+    typist: Typist, loop: LoopPanel, control: ScriptedControl, qtbot: QtBot
+) -> None:
+    assert loop.matrix.currentText() == "escape"
+    loop.matrix.setFocus()
+    QTest.keyClick(loop.matrix, Qt.Key.Key_Down)
+    typist.new_state()
+    assert loop.matrix.currentText() == "docrime", "the choice does not snap back"
+    qtbot.mouseClick(loop.check_button, Qt.MouseButton.LeftButton)
+    typist.new_state()
+    qtbot.mouseClick(loop.apply_button, Qt.MouseButton.LeftButton)
+    qtbot.waitUntil(lambda: control.asked == [("set_loop", {"matrix": "docrime"})])
+
+
 def test_the_result_stays_until_the_next_edit(
     typist: Typist, loop: LoopPanel, control: ScriptedControl, qtbot: QtBot
 ) -> None:
