@@ -3,7 +3,7 @@ registrations.
 
     python benchmarks/studies/loop_comparison.py --seeds 1 2 3 4 5 6 7 8 9 10 --out paired
     python benchmarks/studies/loop_comparison.py --system revolt-shwfs --seeds 1 2 3 4 5 --short 1000 \\
-        --calibration 4000 --set loop.gain=0.4 --out paired --table docs/studies/paired-loops
+        --calibration 4000 --set loop.gain=0.7 --out paired --table docs/studies/paired-loops
     python benchmarks/studies/loop_comparison.py --system maps-nir --no-gains --no-baseline \\
         --out paired --table docs/studies/paired-loops
 
@@ -36,6 +36,7 @@ from scipy import stats
 from escape_hw.api.registration import PARAMETERS, UNITS
 from escape_hw.api.results import CalibrationResult
 from escape_hw.calibration.loop.performance import close_loop
+from escape_hw.calibration.loop.runner import minimum_strehl_frames
 from escape_hw.calibration.optical_gain.bootstrap import bootstrap_gains
 from escape_hw.calibration.sprint.synthetic_matrix import static_light_matrix
 from escape_hw.config.loader import load_system
@@ -300,7 +301,12 @@ def main() -> None:
     parser.add_argument("--table", type=Path, help="folder of the raw table and its page; default: --out")
     parser.add_argument("--name", default="paired")
     options = parser.parse_args()
-    is_pyramid = isinstance(load_system(options.system, overrides=options.set).sensor, PyramidSection)
+    config = load_system(options.system, overrides=options.set)
+    science = config.devices.science or config.devices.wfs
+    least = minimum_strehl_frames(config.devices.wfs.frame_rate_hz, science.frame_rate_hz)
+    if min(options.scan, options.loop) < least:
+        parser.error(f"--scan and --loop: at least {least} frames of {options.system} give a Strehl ratio")
+    is_pyramid = isinstance(config.sensor, PyramidSection)
     options.gains = options.gains and is_pyramid
     keys = ("system", "set", "calibration", "short", "baseline", "gains", "scan", "loop")
     asked = {key: getattr(options, key) for key in keys}
