@@ -181,6 +181,7 @@ def draw(lines: list[dict[str, Any]], path: Path) -> None:
         changes.plot(
             at, values, "o", ms=3.5, color=style.SERIES[k % len(style.SERIES)], label=name.replace("_", " ")
         )
+    changes.set_yscale("symlog", linthresh=5)
     changes.axhspan(-2, 2, color=style.SERIES[1], alpha=0.2, lw=0)
     changes.set(xlabel="pair of matrices, minutes apart", ylabel="change / σ between runs")
     pairs = [line for line in lines if "moved_leaves" in line]

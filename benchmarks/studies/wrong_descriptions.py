@@ -26,6 +26,7 @@ from escape_hw.api.procedure import run
 from escape_hw.api.registration import PARAMETERS
 from escape_hw.api.results import RegistrationEstimate
 from escape_hw.calibration.sprint.fit import fit_registration
+from escape_hw.calibration.sprint.tip_tilt import is_tip_tilt_removed, remove_tip_tilt
 from escape_hw.config.loader import load_system
 from escape_hw.config.system import SystemConfig
 from escape_hw.errors import EscapeError
@@ -106,7 +107,14 @@ def without_actuators(case: Case, count: int) -> InteractionMatrix:
     data = matrix.data.copy()
     dead = np.sort(rng.choice(matrix.m2c.shape[0], count, replace=False))
     data[:, dead] = rng.normal(size=(len(data), count)) * matrix.sigma[:, dead]
-    return replace(matrix, data=data)
+    return as_measured(case, data)
+
+
+def as_measured(case: Case, data: NDArray[np.float32]) -> InteractionMatrix:
+    """A changed matrix without tip and tilt where the sensor removes them."""
+    if is_tip_tilt_removed(case.matrix):
+        data = remove_tip_tilt(data.astype(float)).astype(np.float32)
+    return replace(case.matrix, data=data)
 
 
 def half_outside(case: Case) -> InteractionMatrix:
@@ -115,7 +123,7 @@ def half_outside(case: Case) -> InteractionMatrix:
     dark = np.tile(columns < case.matrix.valid.shape[1] / 2, 2)
     data, sigma = case.matrix.data.copy(), case.matrix.sigma[dark]
     data[dark] = np.random.default_rng(2).normal(size=sigma.shape) * sigma
-    return replace(case.matrix, data=data)
+    return as_measured(case, data)
 
 
 def descriptions(case: Case) -> dict[str, tuple[InteractionMatrix, Sequence[str], NDArray[np.float64]]]:
