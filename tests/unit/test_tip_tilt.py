@@ -14,7 +14,7 @@ N_MODES = 40
 @pytest.mark.parametrize(("exceptions", "removed"), [(0, True), (1, True), (10, False), (N_MODES, False)])
 def test_a_dead_actuator_does_not_hide_it(exceptions, removed):
     data = np.random.default_rng(0).standard_normal((72, N_MODES))
-    data[:, exceptions:] = remove_tip_tilt(data[:, exceptions:])
+    data = np.where(np.arange(N_MODES) < exceptions, data, remove_tip_tilt(data))
     valid = np.ones((6, 6), dtype=bool)
     sigma = np.full(data.shape, 0.1, np.float32)
     matrix = InteractionMatrix(
