@@ -155,7 +155,9 @@ def test_the_message_without_a_server_is_closed_when_one_answers(
     controller.attachment.connection_failed.emit("no server of 'razor-shwfs' runs here")
     titles = [one.title for one in small_window.notifications.notifications]
     assert titles == ["No server"]
-    controller.attachment.attached.emit(LiveSource(FakeConnection(), is_local=True))
+    live = LiveSource(FakeConnection(), is_local=True)
+    monkeypatch.setattr(ServerAttachment, "live", live)
+    controller.attachment.attached.emit(live)
     assert small_window.notifications.notifications == []
     controller.close()
     controller.deleteLater()

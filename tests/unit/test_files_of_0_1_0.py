@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from escape_hw.calibration.modes import bases
 from escape_hw.io.fits.gains import load_gains
 from escape_hw.io.fits.loop import load_loop
 from escape_hw.io.fits.matrix import load_matrix
@@ -95,9 +96,22 @@ def test_matrices_are_compared(document):
     assert min(found["correlation"]) > 0.9
 
 
-def test_an_interrupted_calibration_is_resumed(document, tmp_path):
+def test_an_interrupted_calibration_in_another_basis_is_refused(document, tmp_path):
+    """The modes of this system, 12 of 37, contain tip, tilt and focus better than those of 0.1.0."""
     run = tmp_path / "interrupted"
     shutil.copytree(OLD / "interrupted", run)
+    code, _, err = document("calibrate", "--resume", run, "--frames", 40800, "--out", tmp_path / "resumed")
+    assert code == 2
+    assert "its modal basis is not this system's" in err
+    assert "finish a run of 0.1.0 with that version" in err
+    assert (run / "run.state").read_bytes() == (OLD / "interrupted" / "run.state").read_bytes()
+
+
+def test_an_interrupted_calibration_is_resumed(document, tmp_path, monkeypatch):
+    """As one of a system whose modes are those of 0.1.0: here the response that a mode needs is the best."""
+    run = tmp_path / "interrupted"
+    shutil.copytree(OLD / "interrupted", run)
+    monkeypatch.setattr(bases, "_LEAST_RESPONSE", 1.0)
     code, found, err = document(
         "calibrate", "--resume", run, "--frames", 40800, "--out", tmp_path / "resumed"
     )

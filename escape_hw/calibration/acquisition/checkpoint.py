@@ -136,7 +136,11 @@ def _require_same_run(path: Path, saved: Mapping[str, Any], now: Mapping[str, An
             "resume with the original configuration"
         )
     if saved.get("basis") != now["basis"]:
-        raise IncompatibleProduct(f"{path}: its modal basis is not this system's; start a new run")
+        raise IncompatibleProduct(
+            f"{path}: its modal basis is not this system's. Version 0.2.0 changed the Karhunen-Loeve modes "
+            "of mirrors with many more actuators than modes: finish a run of 0.1.0 with that version, or "
+            "start a new run"
+        )
 
 
 def _changed_keys(path: Path, saved: str, now: str) -> set[str]:

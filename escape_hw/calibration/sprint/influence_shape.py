@@ -143,8 +143,6 @@ class InfluenceShape:
         if self._edge is not None:
             terms = terms + self._fourfold_terms(registration, width)
             common = _add(nominal, coefficients, terms)
-            # Otherwise small edge functions could be displaced by more than the prior allows.
-            jacobian = jacobian * (1 + self._edge * coefficients[len(terms)])
             terms += [self._edge * part for part in (common, width * jacobian[5], *profile, *outward)]
         return ShapedMatrix(nominal, base, _add(nominal, coefficients, terms), jacobian, terms)
 
