@@ -69,8 +69,8 @@ def test_stated_errors_are_those_of_fits_to_noise_that_neighbours_share(missed):
         stated.append(np.diag(sandwich_covariance(weighted, Linear(derivatives, left), noise)))
     ratio = np.mean(stated, axis=0) / np.mean(np.square(errors), axis=0)
     assert (ratio > 0.8).all(), ratio
-    # What leaving out actuators adds is never negative.
-    assert (ratio < 1.8).all(), ratio
+    # What leaving out actuators, and a chi-squared above one by chance, add is never negative.
+    assert (ratio < 2.0).all(), ratio
 
 
 def fitted(seed):

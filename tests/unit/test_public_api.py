@@ -149,7 +149,7 @@ def test_push_pull_takes_the_turbulence_out_and_puts_it_back(own_bench: escape_h
     set_screen = bench.screen._set
     bench.screen._set = lambda want: (seen.append(want.inserted), set_screen(want))[1]  # type: ignore[method-assign]
     try:
-        result = bench.calibrate("push-pull", frames=3)
+        result = bench.calibrate("push-pull", frames=10)
     finally:
         del bench.screen._set
     assert seen == [False, True]

@@ -214,7 +214,9 @@ def sandwich_covariance(
     the scatter of the scores from mode to mode, which contains errors common to all slopes during the
     measurement of a mode. What differences between the actuators and errors of the model of the sensor can
     do to the parameters beyond that is estimated by leaving out groups of actuators and of slopes
-    (:func:`_resampled_covariance`, :func:`_resampled_by_slopes`).
+    (:func:`_resampled_covariance`, :func:`_resampled_by_slopes`). A reduced chi-squared above one multiplies
+    the whole covariance (the scale factor of Birge 1932): a misfit that all groups share, such as that of
+    another family of influence functions, does not show when some are left out.
 
     Parameters
     ----------
@@ -250,4 +252,5 @@ def sandwich_covariance(
     by_slopes = _resampled_by_slopes(system.information(), scores, system.residual, valid)
     covariance = covariance + _positive_part(by_slopes - estimate)
     resampled = _resampled_covariance(system.information(), scores, system.residual, weighted.modes)
-    return np.asarray(covariance + _positive_part(resampled - covariance))
+    covariance = covariance + _positive_part(resampled - covariance)
+    return np.asarray(covariance * max(float(np.mean(np.square(system.residual))) / power, 1.0))
