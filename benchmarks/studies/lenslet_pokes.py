@@ -71,7 +71,7 @@ class Measurement:
         return image
 
     def model(self) -> ShackHartmannModel:
-        """The synthetic model as it is."""
+        """The nominal synthetic model."""
         return ShackHartmannModel(self._bench.config, self.grid)
 
     def model_with_pokes(self, pokes: NDArray[np.float64]) -> ShackHartmannModel:
@@ -92,7 +92,7 @@ def run_realisation(system: str, number: int, n_pokes: int, overrides: list[str]
             pokes = rng.uniform(-1, 1, (n_pokes, amplitude.size)) * amplitude * fraction
             measured = Measurement(bench, pokes)
             row: Line = {"fraction": fraction, "motion_px": measured.grid.motion_px}
-            models = {"as it is": measured.model(), "pokes": measured.model_with_pokes(pokes[:N_WEIGHTS])}
+            models = {"nominal": measured.model(), "pokes": measured.model_with_pokes(pokes[:N_WEIGHTS])}
             for label, model in models.items():
                 found = sprint(measured.matrix, model, start=injected, coarse_search=False)
                 row[label] = {
@@ -106,7 +106,7 @@ def run_realisation(system: str, number: int, n_pokes: int, overrides: list[str]
 def print_table(rows: list[Line]) -> None:
     """Mean error of the shifts in % of a sub-aperture, by fraction and model."""
     for k, fraction in enumerate(FRACTIONS):
-        for label in ("as it is", "pokes"):
+        for label in ("nominal", "pokes"):
             errors = np.array([row["fractions"][k][label]["error"][:2] for row in rows])
             print(fraction, label, np.round(errors.mean(axis=0), 3).tolist())
 

@@ -625,7 +625,7 @@ class Connection:
         Raises
         ------
         RequestRefused
-            A procedure runs, or the loop is closed and needs the camera as it is.
+            A procedure runs, or the loop is closed, which needs the camera unchanged.
         SettingRejected
             A value is outside the range of the camera, which is unchanged.
         """

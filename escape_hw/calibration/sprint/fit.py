@@ -400,7 +400,7 @@ def _build_estimate(
         notes += () if remark is None else (remark,)
     sigma = np.sqrt(np.diag(covariance))
     between_runs = repeatability_covariance(weighted, solution.system, noise, context.model)
-    # The registration of a run repeats at least as well as it is known.
+    # Differences between runs are not less certain than the registration itself.
     share = np.minimum(1.0, sigma[1:6] / np.sqrt(np.diag(between_runs)))
     warnings = check_convergence(context, weighted, solution, sigma[1:6])
     if not warnings:
