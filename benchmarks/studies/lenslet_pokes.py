@@ -4,9 +4,9 @@
 
 The mirror equals the nominal one, and slopes are computed from images without noise, so that only the
 response of the spots to the pokes differs from the synthetic model. Random pokes of all modes, a fraction of
-those of the configuration, are regressed as DO-CRIME does, and SPRINT fits the result: with the model as it
-is, whose weights average over a uniform tilt of each lenslet, and with weights averaged over the wavefronts
-of the pokes at the injected registration. Writes ``SYSTEM.jsonl`` with a line per realisation of the pokes
+those of the configuration, are regressed as DO-CRIME does, and SPRINT fits the result: with weights averaged
+over uniform tilts of each lenslet alone, and with weights averaged over the wavefronts of random pokes of the
+same rms as well. Writes ``SYSTEM.jsonl`` with a line per realisation of the pokes
 and fraction.
 """
 
@@ -31,8 +31,8 @@ from escape_hw.runtime.session.system import System, open_system
 from escape_sim.devices.true_optical_gains import get_simulated_bench
 from escape_sim.models.shack_hartmann import ShackHartmannModel
 
-#: Fractions of the configured poke, and pokes for the mean weights.
-FRACTIONS, N_WEIGHTS = (0.25, 0.5, 1.0), 200
+#: Fractions of the configured poke.
+FRACTIONS = (0.25, 0.5, 1.0)
 #: Counts of the brightest pixel on a flat wavefront.
 PEAK_COUNTS = 150.0
 IDEAL = (
@@ -63,7 +63,8 @@ class Measurement:
         motion = float(np.sqrt(slopes.var(axis=0).mean()))
         if not isinstance(grid, SubApertureGrid):
             raise SystemExit("this study is for Shack-Hartmann sensors")
-        self.grid = replace(grid, motion_px=motion, turbulence_px=0.0)
+        rms = float(np.sqrt(np.square(pokes).sum(axis=1).mean()))
+        self.grid = grid.with_slope_statistics(motion, rms)
 
     def _image(self, command: NDArray[np.float64]) -> NDArray[np.float32]:
         image = np.zeros(self._shape, np.float32)
@@ -71,16 +72,17 @@ class Measurement:
         return image
 
     def model(self) -> ShackHartmannModel:
-        """The nominal synthetic model."""
+        """The model whose response is averaged over tilts of the lenslets."""
+        return ShackHartmannModel(self._bench.config, replace(self.grid, pokes=0.0))
+
+    def model_with_pokes(self) -> ShackHartmannModel:
+        """The model with which SPRINT averages over the wavefronts of random pokes, where it has found them."""
         return ShackHartmannModel(self._bench.config, self.grid)
 
-    def model_with_pokes(self, pokes: NDArray[np.float64]) -> ShackHartmannModel:
-        """The model whose weights are averaged over the wavefronts of pokes at the true registration."""
-        paths = [self._twin.mirror_opd(self.m2c @ poke) for poke in pokes]
-        return ShackHartmannModel(self._bench.config, self.grid, paths)
 
-
-def run_realisation(system: str, number: int, n_pokes: int, overrides: list[str]) -> Line:
+def run_realisation(
+    system: str, number: int, n_pokes: int, overrides: list[str], fractions: tuple[float, ...] = FRACTIONS
+) -> Line:
     """Errors of the registration by fraction of the poke, with either model."""
     rng, rows = np.random.default_rng(number), []
     coupling = load_system(system).devices.dm.coupling
@@ -88,11 +90,11 @@ def run_realisation(system: str, number: int, n_pokes: int, overrides: list[str]
     with open_system(system, seed=number, set=changes) as bench:
         injected = bench.config.twin.registration.to_registration()
         amplitude = compute_random_amplitudes(bench, build_modal_basis(bench), bench.config.calibration.poke)
-        for fraction in FRACTIONS:
+        for fraction in fractions:
             pokes = rng.uniform(-1, 1, (n_pokes, amplitude.size)) * amplitude * fraction
             measured = Measurement(bench, pokes)
             row: Line = {"fraction": fraction, "motion_px": measured.grid.motion_px}
-            models = {"nominal": measured.model(), "pokes": measured.model_with_pokes(pokes[:N_WEIGHTS])}
+            models = {"nominal": measured.model(), "pokes": measured.model_with_pokes()}
             for label, model in models.items():
                 found = sprint(measured.matrix, model, start=injected, coarse_search=False)
                 row[label] = {

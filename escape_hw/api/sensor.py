@@ -162,6 +162,8 @@ class SubApertureGrid(SensorGeometry):
     turbulence_px
         Part of ``motion_px`` that is correlated between frames in open loop, and therefore due to the
         turbulence and not to pokes; rms per axis in pixels, 0 if unknown.
+    pokes
+        Rms surface of the random pokes, all modes, as fraction of full stroke; 0 without random pokes.
     """
 
     kind: ClassVar[str] = "shack-hartmann"
@@ -181,6 +183,7 @@ class SubApertureGrid(SensorGeometry):
     motion_px: float = 0.0
     background: float = 0.0
     turbulence_px: float = 0.0
+    pokes: float = 0.0
     __repr__ = short_repr
 
     def centres_px(self) -> NDArray[np.float64]:
@@ -207,7 +210,7 @@ class SubApertureGrid(SensorGeometry):
             if persistent_fraction
             else self.turbulence_px
         )
-        return replace(self, motion_px=SPOT_MOTION_FACTOR * rms, turbulence_px=turbulence)
+        return replace(self, motion_px=SPOT_MOTION_FACTOR * rms, turbulence_px=turbulence, pokes=pokes)
 
     def with_mean_slopes(self, mean: NDArray[np.float64]) -> SubApertureGrid:
         """See :meth:`SensorGeometry.with_mean_slopes`; fits a regular lattice to the mean spots.

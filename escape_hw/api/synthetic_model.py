@@ -157,6 +157,18 @@ class HasPupilShift(Protocol):
 
 
 @runtime_checkable
+class HasPokeResponse(Protocol):
+    """A model whose response depends on the shapes of the random pokes of the measurement."""
+
+    def around_pokes(self, registration: Registration, m2c: NDArray[np.float64]) -> SyntheticModel | None:
+        """The model whose response is the mean around random pokes of modes ``m2c (n_act, n_modes)``.
+
+        ``None`` if that makes no difference, or the measurement had no random pokes. The registration is
+        where the pokes are computed, not that of the model returned.
+        """
+
+
+@runtime_checkable
 class DifferentiableModel(SyntheticModel, Protocol):
     """A synthetic model with modal matrices and analytic derivatives.
 

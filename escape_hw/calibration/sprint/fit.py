@@ -312,7 +312,12 @@ def _solve_with_updates(
     state: MixedEffectsState | None,
 ) -> Procedure[tuple[WeightedMatrix, SprintSolution]]:
     """Solve, then again with priors and outlier weights from the data; the last weights and solution."""
-    solution = yield from solve(context, weighted, start, coarse_search, state)
+    solution = None
+    if state is None:
+        solution = yield from solve(context, weighted, start, coarse_search)
+        start, state = solution.alpha, solution.state
+    if context.use_pokes(start) or solution is None:
+        solution = yield from solve(context, weighted, start, False, state)
     if update_priors and solution.estimate_priors is not None:
         context.priors = solution.estimate_priors().priors
         solution = yield from solve(context, weighted, solution.alpha, False, solution.state)

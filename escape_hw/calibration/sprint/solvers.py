@@ -17,10 +17,14 @@ from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.procedure import Procedure, Progress, Reporter
 from escape_hw.api.registration import TO_STREAM_UNITS, Registration
 from escape_hw.api.results import ActuatorCorrections, SprintIteration
-from escape_hw.api.synthetic_model import HasSlopeWeights, SyntheticModel
+from escape_hw.api.synthetic_model import HasPokeResponse, HasSlopeWeights, SyntheticModel
 from escape_hw.calibration.sprint.coarse_search import low_mode_problem, search_registration
 from escape_hw.calibration.sprint.covariance import LinearisedProblem
-from escape_hw.calibration.sprint.extra_parameters import ExtraParameterModel, FittedExtraParameter
+from escape_hw.calibration.sprint.extra_parameters import (
+    ExtraParameterModel,
+    FittedExtraParameter,
+    build_fitted_extra_parameters,
+)
 from escape_hw.calibration.sprint.least_squares import (
     NEGLIGIBLE_STEP,
     BatchProblem,
@@ -66,6 +70,17 @@ class SolverContext:
 
     def __post_init__(self) -> None:
         self.report = Reporter("SPRINT", self.max_iterations, "iteration")
+
+    def use_pokes(self, alpha: NDArray[np.float64]) -> bool:
+        """Replace the model by the one around the pokes at ``alpha (5,)``; whether there is one."""
+        if not isinstance(self.model, HasPokeResponse):
+            return False
+        model = self.model.around_pokes(Registration.from_array(alpha), self.matrix.m2c)
+        if model is None:
+            return False
+        self.model, self.problem = model, None
+        self.extras = build_fitted_extra_parameters(model, [one.name for one in self.extras])
+        return True
 
     def progress(self, sigma: NDArray[np.float64] | None = None) -> Progress:
         """The iterations so far, and the standard errors of the last one ``(5,)``, NaN while unknown."""

@@ -90,6 +90,11 @@ class TipTiltFreeModel:
 
     def __getattr__(self, name: str) -> Any:
         attribute = getattr(self._model, name)
-        if name == "with_pupil_shift":  # another model, treated alike
-            return lambda *shift: TipTiltFreeModel(attribute(*shift))
-        return attribute
+        if name not in ("with_pupil_shift", "around_pokes"):
+            return attribute
+
+        def treated_alike(*arguments: Any) -> TipTiltFreeModel | None:
+            other = attribute(*arguments)
+            return None if other is None else TipTiltFreeModel(other)
+
+        return treated_alike

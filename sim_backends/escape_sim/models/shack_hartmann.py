@@ -17,7 +17,7 @@ from numpy.typing import DTypeLike, NDArray
 from scipy.special import ndtri
 
 from escape_hw.api.registration import Registration
-from escape_hw.api.sensor import SubApertureGrid
+from escape_hw.api.sensor import SPOT_MOTION_FACTOR, SubApertureGrid
 from escape_hw.config.sensor import ShackHartmannSection
 from escape_hw.pipeline.slopes.shack_hartmann import subaperture_windows
 from escape_sim.mirror.influence_functions import InfluenceFunctions
@@ -65,48 +65,43 @@ def slope_weights(
     scalings would be underestimated.
 
     With ``wavefronts_m``, optical paths ``(n, n)`` in metres over the pupil, the derivative is averaged over
-    these instead. Pokes of a mirror with about one actuator per lenslet are not tilts of whole lenslets
-    (docs/studies/lenslet-pokes.md).
+    these as well: each is added to a spot motion. Pokes of a mirror with about one actuator per lenslet are
+    not tilts of whole lenslets (docs/studies/lenslet-pokes.md).
 
     Returns
     -------
     dict
         For each step in :data:`NEIGHBOURS`: ``(2, n_valid, p, p)`` in pixels per metre, x then y.
     """
-    window_images = _WindowImages(config, grid, pupil)
+    is_mean = grid.motion_px > 0 or len(wavefronts_m) > 0
+    window_images = _WindowImages(config, grid, pupil, is_mean=is_mean)
     wave = 2 * np.pi / config.system.wavelength_m
-    if len(wavefronts_m):
-        return _mean_over_wavefronts(window_images, grid, pupil, wavefronts_m, wave)
-    shifts = grid.motion_px * gaussian_lattice() if grid.motion_px else np.zeros((1, 2))
+    shifts = grid.motion_px * gaussian_lattice() if is_mean else np.zeros((1, 2))
     blur = np.zeros((len(shifts), pupil.n_pix, pupil.n_pix))
-    if grid.motion_px and grid.turbulence_px:
+    if is_mean and grid.turbulence_px:
         blur = np.sqrt(_turbulence_strength(config, grid)) * lenslet_turbulence(pupil.n_pix)
     out = {step: np.zeros((2, grid.n_valid, pupil.n_pix, pupil.n_pix)) for step in NEIGHBOURS}
-    for shift, phase in zip(shifts, blur, strict=True):
-        moved = window_images.moved(shift, phase)
-        window_images.accumulate(out, dict.fromkeys(NEIGHBOURS, moved), 1 / len(shifts))
+    nodes = max(len(shifts), len(wavefronts_m))
+    for node in range(nodes):
+        moved = window_images.moved(shifts[node % len(shifts)], blur[node % len(shifts)])
+        phasors = dict.fromkeys(NEIGHBOURS, moved)
+        if len(wavefronts_m):
+            around = _neighbour_phasors(grid, pupil, wave * wavefronts_m[node % len(wavefronts_m)])
+            phasors = {step: moved * phasor for step, phasor in around.items()}
+        window_images.accumulate(out, phasors, 1 / nodes)
     return {step: block * wave for step, block in out.items()}
 
 
-def _mean_over_wavefronts(
-    window_images: _WindowImages,
-    grid: SubApertureGrid,
-    pupil: PupilGeometry,
-    wavefronts_m: Sequence[NDArray[np.floating]],
-    wave: float,
-) -> dict[tuple[int, int], NDArray[np.float64]]:
-    """Weights of :func:`slope_weights`, averaged over wavefronts."""
+def _neighbour_phasors(
+    grid: SubApertureGrid, pupil: PupilGeometry, phase: NDArray[np.floating]
+) -> dict[tuple[int, int], NDArray[np.complex64]]:
+    """Phasors ``(n_valid, p, p)`` of a phase over the pupil on the lenslets at each step from a window."""
     n, p = pupil.n_sub, pupil.n_pix
-    out = {step: np.zeros((2, grid.n_valid, p, p)) for step in NEIGHBOURS}
     rows, columns = np.nonzero(grid.valid)
-    for wavefront in wavefronts_m:
-        phase = wave * wavefront.reshape(n, p, n, p).transpose(0, 2, 1, 3)
-        phasor = np.exp(1j * phase).astype(np.complex64)
-        phasors = {
-            (i, j): phasor[np.clip(rows + i, 0, n - 1), np.clip(columns + j, 0, n - 1)] for i, j in NEIGHBOURS
-        }
-        window_images.accumulate(out, phasors, 1 / len(wavefronts_m))
-    return {step: block * wave for step, block in out.items()}
+    phasor = np.exp(1j * phase.reshape(n, p, n, p).transpose(0, 2, 1, 3)).astype(np.complex64)
+    return {
+        (i, j): phasor[np.clip(rows + i, 0, n - 1), np.clip(columns + j, 0, n - 1)] for i, j in NEIGHBOURS
+    }
 
 
 def gaussian_lattice() -> NDArray[np.float64]:
@@ -155,7 +150,9 @@ def _turbulence_strength(config: SystemConfig, grid: SubApertureGrid) -> float:
 class _WindowImages:
     """Images of a window's nine lenslets on the window's pixels, for all windows at once."""
 
-    def __init__(self, config: SystemConfig, grid: SubApertureGrid, pupil: PupilGeometry) -> None:
+    def __init__(
+        self, config: SystemConfig, grid: SubApertureGrid, pupil: PupilGeometry, *, is_mean: bool
+    ) -> None:
         sensor = config.sensor_as(ShackHartmannSection)
         n, p, spot = pupil.n_sub, pupil.n_pix, sensor.spot_px
         width, height = config.devices.wfs.region[2:]
@@ -182,9 +179,9 @@ class _WindowImages:
         # Axes of the lattice in each window (2, n_valid), and orientation of the wavefronts in it.
         self._axes = np.stack([np.cos(angle), np.sin(angle)])
         self._orientation = np.arange(len(rows)) % _N_ORIENTATIONS
-        # Single precision suffices for the average over motion, not for the small-signal limit.
-        self._real = np.dtype(np.float32 if grid.motion_px else np.float64)
-        self._complex = np.dtype(np.complex64 if grid.motion_px else np.complex128)
+        # Single precision suffices for an average over wavefronts, not for the small-signal limit.
+        self._real = np.dtype(np.float32 if is_mean else np.float64)
+        self._complex = np.dtype(np.complex64 if is_mean else np.complex128)
         self._blocks, self._along = {}, {}
         field = field_pixels(p, spot)
         # Windows are on the measured grid; lenslets are where the references, averaged over the run,
@@ -385,6 +382,10 @@ def _apply_to_factors(table, first_y, first_x, side, y, out):  # type: ignore[no
 _MOTION_UNCERTAINTY = 0.25
 #: Up to this many modes, forming their surfaces is faster than the slopes of all actuators.
 _MAX_DIRECT_MODES = 12
+#: Actuator pitch in lenslets up to which the shapes of pokes within lenslets count: with 2.4 they do not.
+_MAX_PITCH = 1.5
+#: Random pokes for each node of the spot motion.
+_N_POKES = 4
 
 
 def nominal_grid(config: SystemConfig) -> SubApertureGrid:
@@ -428,8 +429,7 @@ class ShackHartmannModel(DesignModel):
             )
         self._opd_per_command_m = 2 * config.devices.dm.stroke_m
         self._grid = grid
-        # The motion of the spots is known where their wavefronts are.
-        self._variants: list[ShackHartmannModel] | None = [] if len(wavefronts_m) else None
+        self._variants: list[ShackHartmannModel] | None = None
         self._wavefronts_m = tuple(wavefronts_m)
 
     @cached_property
@@ -527,8 +527,30 @@ class ShackHartmannModel(DesignModel):
         return np.asarray(parts[0] @ modes, dtype=float), out
 
     def variants(self) -> list[ShackHartmannModel]:
-        """The model with spot motion larger by its uncertainty, see :class:`SyntheticModel`."""
+        """The model with spot motion and pokes larger by the uncertainty of the motion, see :class:`SyntheticModel`."""
         if self._variants is None:
             grid = replace(self._grid, motion_px=self._grid.motion_px * (1 + _MOTION_UNCERTAINTY))
-            self._variants = [ShackHartmannModel(self._config, grid)] if grid.motion_px else []
+            wavefronts = [(1 + _MOTION_UNCERTAINTY) * one for one in self._wavefronts_m]
+            varied = ShackHartmannModel(self._config, grid, wavefronts)
+            self._variants = [varied] if grid.motion_px or wavefronts else []
         return list(self._variants)
+
+    def around_pokes(self, registration: Registration, m2c: NDArray[np.float64]) -> ShackHartmannModel | None:
+        """The model around random pokes, see :class:`HasPokeResponse`.
+
+        The pokes are drawn with equal amplitudes of all modes and the measured rms; the rest of the measured
+        motion of the spots is tilts.
+        """
+        grid, n_modes = self._grid, m2c.shape[1]
+        if not grid.pokes or self._gaussian.pitch_m > _MAX_PITCH * self.sub_aperture_m:
+            return None
+        half = np.random.default_rng(3).uniform(-1, 1, (n_modes, _N_POKES * _N_NODES // 2))
+        half *= grid.pokes * np.sqrt(3 / n_modes)
+        # Opposite nodes of the spot motion have opposite pokes.
+        blocks = half.reshape(n_modes, _N_POKES, -1)
+        pokes = np.concatenate([blocks, -blocks[:, :, ::-1]], axis=2).reshape(n_modes, -1)
+        poke_motion = SPOT_MOTION_FACTOR * float((self.modal_matrix(registration, m2c) @ half).std())
+        rest = float(np.sqrt(max(0.0, grid.motion_px**2 - poke_motion**2)))
+        surfaces = self._surfaces(self._pupil.coordinates_m, registration)
+        paths = np.tensordot((m2c @ pokes).T * self._opd_per_command_m, surfaces, 1)
+        return ShackHartmannModel(self._config, replace(grid, motion_px=rest, pokes=0.0), tuple(paths))

@@ -1,0 +1,43 @@
+"""Mirrors with an actuator per lenslet: the response around pokes, which are not tilts of whole lenslets."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from escape_hw.api.registration import Registration
+from escape_hw.calibration.sprint.tip_tilt import TipTiltFreeModel
+from escape_hw.config.loader import load_system
+from escape_sim.models.shack_hartmann import ShackHartmannModel, nominal_grid
+
+STUDIES = Path(__file__).parents[2] / "benchmarks" / "studies"
+
+
+def test_shift_from_images_of_pokes(monkeypatch):
+    monkeypatch.syspath_prepend(STUDIES)
+    from lenslet_pokes import run_realisation
+
+    (row,) = run_realisation("revolt-shwfs", 1, 400, [], fractions=(1.0,))["fractions"]
+    # Without noise; the random pokes themselves scatter by 0.03 %.
+    assert np.abs(row["pokes"]["error"][:2]).max() < 0.1
+    assert np.abs(row["nominal"]["error"][:2]).max() > 0.15
+
+
+def test_only_dense_actuators_and_random_pokes_have_such_a_response():
+    revolt, razor = (load_system(name) for name in ("revolt-shwfs", "razor-shwfs"))
+    m2c = np.eye(revolt.devices.dm.n_act, 3)
+    poked = replace(nominal_grid(revolt), motion_px=1.0, pokes=0.01)
+    model = ShackHartmannModel(revolt, poked)
+    around = model.around_pokes(Registration(), m2c)
+    assert around is not None
+    assert around.around_pokes(Registration(), m2c) is None
+    assert len(around.variants()) == len(model.variants())
+    assert ShackHartmannModel(revolt, replace(poked, pokes=0.0)).around_pokes(Registration(), m2c) is None
+    sparse = ShackHartmannModel(razor, replace(nominal_grid(razor), motion_px=1.0, pokes=0.01))
+    assert sparse.around_pokes(Registration(), np.eye(razor.devices.dm.n_act, 3)) is None
+    without_tilt = TipTiltFreeModel(model).around_pokes(Registration(), m2c)
+    assert isinstance(without_tilt, TipTiltFreeModel)
+    slopes = without_tilt.zonal_matrix(Registration())[:, 100].reshape(2, -1)
+    assert np.abs(slopes.mean(axis=1)).max() < 1e-9 * np.abs(slopes).max()
