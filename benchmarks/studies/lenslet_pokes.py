@@ -76,7 +76,7 @@ class Measurement:
         return ShackHartmannModel(self._bench.config, replace(self.grid, pokes=0.0))
 
     def model_with_pokes(self) -> ShackHartmannModel:
-        """The model with which SPRINT averages over the wavefronts of random pokes, where it has found them."""
+        """The model that SPRINT replaces by the one around random pokes."""
         return ShackHartmannModel(self._bench.config, self.grid)
 
 

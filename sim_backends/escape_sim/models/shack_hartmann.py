@@ -527,7 +527,7 @@ class ShackHartmannModel(DesignModel):
         return np.asarray(parts[0] @ modes, dtype=float), out
 
     def variants(self) -> list[ShackHartmannModel]:
-        """The model with spot motion and pokes larger by the uncertainty of the motion, see :class:`SyntheticModel`."""
+        """The model with spot motion and pokes larger by the motion's uncertainty, see :class:`SyntheticModel`."""
         if self._variants is None:
             grid = replace(self._grid, motion_px=self._grid.motion_px * (1 + _MOTION_UNCERTAINTY))
             wavefronts = [(1 + _MOTION_UNCERTAINTY) * one for one in self._wavefronts_m]
