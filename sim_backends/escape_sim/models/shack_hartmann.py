@@ -384,8 +384,10 @@ _MOTION_UNCERTAINTY = 0.25
 _MAX_DIRECT_MODES = 12
 #: Actuator pitch in lenslets up to which the shapes of pokes within lenslets count: with 2.4 they do not.
 _MAX_PITCH = 1.5
-#: Random pokes for each node of the spot motion.
-_N_POKES = 4
+#: Random pokes for each node of the spot motion: their sample moves the shift by 0.02 % of a sub-aperture.
+_N_POKES = 8
+#: Changes of the registration, in its units, within which the pokes need not be computed again.
+_SAME_POKES_WITHIN = np.array([0.5, 0.5, 0.05, 0.1, 0.1])
 
 
 def nominal_grid(config: SystemConfig) -> SubApertureGrid:
@@ -431,6 +433,7 @@ class ShackHartmannModel(DesignModel):
         self._grid = grid
         self._variants: list[ShackHartmannModel] | None = None
         self._wavefronts_m = tuple(wavefronts_m)
+        self._around_pokes: tuple[Registration, ShackHartmannModel] | None = None
 
     @cached_property
     def _slopes(self) -> SlopeOperator:
@@ -527,7 +530,7 @@ class ShackHartmannModel(DesignModel):
         return np.asarray(parts[0] @ modes, dtype=float), out
 
     def variants(self) -> list[ShackHartmannModel]:
-        """The model with spot motion and pokes larger by the motion's uncertainty, see :class:`SyntheticModel`."""
+        """The model with motion and pokes larger by the motion's uncertainty, see :class:`SyntheticModel`."""
         if self._variants is None:
             grid = replace(self._grid, motion_px=self._grid.motion_px * (1 + _MOTION_UNCERTAINTY))
             wavefronts = [(1 + _MOTION_UNCERTAINTY) * one for one in self._wavefronts_m]
@@ -544,6 +547,10 @@ class ShackHartmannModel(DesignModel):
         grid, n_modes = self._grid, m2c.shape[1]
         if not grid.pokes or self._gaussian.pitch_m > _MAX_PITCH * self.sub_aperture_m:
             return None
+        if self._around_pokes is not None:
+            place, model = self._around_pokes
+            if (np.abs(registration.to_array() - place.to_array()) < _SAME_POKES_WITHIN).all():
+                return model
         half = np.random.default_rng(3).uniform(-1, 1, (n_modes, _N_POKES * _N_NODES // 2))
         half *= grid.pokes * np.sqrt(3 / n_modes)
         # Opposite nodes of the spot motion have opposite pokes.
@@ -553,4 +560,6 @@ class ShackHartmannModel(DesignModel):
         rest = float(np.sqrt(max(0.0, grid.motion_px**2 - poke_motion**2)))
         surfaces = self._surfaces(self._pupil.coordinates_m, registration)
         paths = np.tensordot((m2c @ pokes).T * self._opd_per_command_m, surfaces, 1)
-        return ShackHartmannModel(self._config, replace(grid, motion_px=rest, pokes=0.0), tuple(paths))
+        model = ShackHartmannModel(self._config, replace(grid, motion_px=rest, pokes=0.0), tuple(paths))
+        self._around_pokes = registration, model
+        return model
