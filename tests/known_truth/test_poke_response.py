@@ -33,6 +33,11 @@ def test_only_dense_actuators_and_random_pokes_have_such_a_response():
     around = model.around_pokes(Registration(), m2c)
     assert around is not None
     assert around.around_pokes(Registration(), m2c) is None
+    # The scale of the modes does not matter: those of a regression with coloured pokes have another one.
+    scaled = ShackHartmannModel(revolt, poked).around_pokes(Registration(), 7 * m2c)
+    assert scaled is not None
+    matrices = (one.zonal_matrix(Registration()) for one in (around, scaled))
+    np.testing.assert_allclose(*matrices, atol=1e-5)
     assert len(around.variants()) == len(model.variants())
     assert ShackHartmannModel(revolt, replace(poked, pokes=0.0)).around_pokes(Registration(), m2c) is None
     sparse = ShackHartmannModel(razor, replace(nominal_grid(razor), motion_px=1.0, pokes=0.01))

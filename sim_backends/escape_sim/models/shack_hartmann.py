@@ -551,15 +551,17 @@ class ShackHartmannModel(DesignModel):
             place, model = self._around_pokes
             if (np.abs(registration.to_array() - place.to_array()) < _SAME_POKES_WITHIN).all():
                 return model
-        half = np.random.default_rng(3).uniform(-1, 1, (n_modes, _N_POKES * _N_NODES // 2))
-        half *= grid.pokes * np.sqrt(3 / n_modes)
-        # Opposite nodes of the spot motion have opposite pokes.
-        blocks = half.reshape(n_modes, _N_POKES, -1)
-        pokes = np.concatenate([blocks, -blocks[:, :, ::-1]], axis=2).reshape(n_modes, -1)
-        poke_motion = SPOT_MOTION_FACTOR * float((self.modal_matrix(registration, m2c) @ half).std())
-        rest = float(np.sqrt(max(0.0, grid.motion_px**2 - poke_motion**2)))
+        half = m2c @ np.random.default_rng(3).uniform(-1, 1, (n_modes, _N_POKES * _N_NODES // 2))
         surfaces = self._surfaces(self._pupil.coordinates_m, registration)
-        paths = np.tensordot((m2c @ pokes).T * self._opd_per_command_m, surfaces, 1)
+        # The scale of the modes does not matter.
+        lit = np.tensordot(half.T, surfaces[:, self._pupil.lit], 1)
+        half *= grid.pokes / lit.std()
+        # Opposite nodes of the spot motion have opposite pokes.
+        blocks = half.reshape(len(half), _N_POKES, -1)
+        pokes = np.concatenate([blocks, -blocks[:, :, ::-1]], axis=2).reshape(len(half), -1)
+        poke_motion = SPOT_MOTION_FACTOR * float((self.modal_matrix(registration, half)).std())
+        rest = float(np.sqrt(max(0.0, grid.motion_px**2 - poke_motion**2)))
+        paths = np.tensordot(pokes.T * self._opd_per_command_m, surfaces, 1)
         model = ShackHartmannModel(self._config, replace(grid, motion_px=rest, pokes=0.0), tuple(paths))
         self._around_pokes = registration, model
         return model
