@@ -477,7 +477,7 @@ class MainWindow(QMainWindow):
             return
         self.update_timer.stop()
         self.replay.close()
-        self.run_browser.shut_down()
+        self.run_browser.hide()
         for other in self.replay_windows:
             other.close()
             other.context.session.close()

@@ -38,19 +38,15 @@ class RunSummary:
     simulated: bool
 
     @property
-    def cells(self) -> tuple[str, ...]:
-        """Texts of :data:`COLUMNS`."""
+    def cells(self) -> list[tuple[str, float | str]]:
+        """Text and value for sorting of each of :data:`COLUMNS`."""
         system = f"{self.system} (simulated)" if self.simulated else self.system
-        return (
-            self.date, self.name, system, self.method,
-            f"{self.frames:,}" if self.frames else "", self.quality.text if self.quality is not None else "",
-            f"{self.size_mb:.1f} MB",
-        )  # fmt: skip
-
-    def matches(self, words: str) -> bool:
-        """Whether all words occur in the row."""
-        text = " ".join((*self.cells, self.verdict)).lower()
-        return all(word in text for word in words.lower().split())
+        quality = ("", -1) if self.quality is None else (self.quality.text, self.quality)
+        return [
+            (self.date, self.date), (self.name, self.name), (system, self.system), (self.method, self.method),
+            (f"{self.frames:,}" if self.frames else "", self.frames), quality,
+            (f"{self.size_mb:.1f} MB", self.size_mb),
+        ]  # fmt: skip
 
 
 def read_runs(runs: Path) -> Iterator[RunSummary]:

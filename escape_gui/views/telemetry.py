@@ -52,12 +52,16 @@ class Spectra:
         )  # fmt: skip
 
 
+def size_text(size: float) -> str:
+    """A number of bytes in MB or GB."""
+    return f"{size / 1e9:,.2f} GB" if size >= 1e9 else f"{size / 1e6:,.1f} MB"
+
+
 def describe_growth(recording: RecordingState, seconds: float) -> str:
     """Progress or end of a recording in a line."""
     if not recording.path:
         return "no recording yet"
-    size = f"{recording.size / 1e6:,.1f} MB" if recording.size < 1e9 else f"{recording.size / 1e9:,.2f} GB"
-    parts = [f"{recording.written:,} entries", size]
+    parts = [f"{recording.written:,} entries", size_text(recording.size)]
     if recording.recording:
         parts.insert(0, f"{seconds:,.0f} s")
     if recording.dropped:
