@@ -22,7 +22,7 @@ from PySide6.QtWidgets import (
     QWidget,
 )
 
-from escape_gui.client.alarms import AlarmMonitor
+from escape_gui.client.alarms import LimitMonitor
 from escape_gui.client.availability import tooltip
 from escape_gui.client.session import Session
 from escape_gui.panels import PANELS
@@ -96,7 +96,7 @@ class MainWindow(QMainWindow):
             self.context, self.actions_by_name["open_loop"], self.actions_by_name["flatten"]
         )
         self.fault_banner = FaultBanner(self.context, self.actions_by_name["clear_fault"])
-        self.alarms = AlarmMonitor(settings.alarms, self._log_alarm)
+        self.alarms = LimitMonitor(settings.alarms, self._log_alarm)
         self.alarm_banner = AlarmBanner(self.context, self.actions_by_name["acknowledge"])
         self.alarm_dialog = AlarmDialog(self, settings)
         self.frozen_banner = FrozenBanner(self.context, self.actions_by_name["freeze"])

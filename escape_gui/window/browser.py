@@ -12,7 +12,7 @@ from PySide6.QtGui import QDesktopServices
 from PySide6.QtWidgets import QDialog, QLineEdit, QPushButton, QWidget
 
 from escape_gui.client.session import Session, runs_folder
-from escape_gui.widgets.browser_table import Cell, browser_table
+from escape_gui.widgets.browser_table import SortableCell, browser_table
 from escape_gui.widgets.controls import column, row, text_label
 
 
@@ -107,7 +107,7 @@ class FolderBrowser(QDialog, Generic[T]):
         self.table.setRowCount(len(entries))
         for line, entry in enumerate(entries):
             for k, (text, value) in enumerate(self._cells(entry)):
-                cell = Cell(text, value)
+                cell = SortableCell(text, value)
                 cell.setData(_ENTRY, entry)
                 cell.setToolTip(self._details(entry))
                 self.table.setItem(line, k, cell)

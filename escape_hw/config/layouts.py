@@ -279,7 +279,13 @@ def positions(layout: str) -> NDArray[np.float64]:
     points = _parse(layout).points
     if points is not None:
         return np.array(points)
-    grid = layout_map(layout)
+    return grid_positions(layout_map(layout))
+
+
+def grid_positions(grid: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Positions ``(n_act, 2)`` (x, y) of the actuators of a map, row by row, in pitches from its centre."""
+    import numpy as np
+
     rows, columns = np.nonzero(grid)
     return np.stack([columns, rows], axis=1) - (np.array(grid.shape[::-1]) - 1) / 2
 

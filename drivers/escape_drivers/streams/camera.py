@@ -70,7 +70,7 @@ class StreamCamera(BlockingCamera[Stream]):
     name
         Name in messages.
     **settings
-        Fields of :class:`~escape_drivers.common.camera.CameraRequest` and of :class:`StreamCameraOptions`.
+        Fields of :class:`~escape_drivers.common.camera.CameraSetup` and of :class:`StreamCameraOptions`.
 
     Raises
     ------
@@ -82,8 +82,8 @@ class StreamCamera(BlockingCamera[Stream]):
 
     def __init__(self, stream: str, *, serial: str = "", name: str = "camera", **settings: Any) -> None:
         serial = stream_serial("stream", serial, stream)
-        request, options = split_settings(name, serial, {**settings, "stream": stream}, StreamCameraOptions)
-        super().__init__(name, request, self.SOURCE.kind, _COUNTER_RANGE)
+        setup, options = split_settings(name, serial, {**settings, "stream": stream}, StreamCameraOptions)
+        super().__init__(name, setup, self.SOURCE.kind, _COUNTER_RANGE)
         self._options = options
         self._info = self._make_info(self.SOURCE.kind)
         self._last_count, self._written_ns = 0, 0
@@ -106,7 +106,7 @@ class StreamCamera(BlockingCamera[Stream]):
             )
         self._adopt_sensor((stream.shape[1], stream.shape[0]), "to the size of the stream")
         self._info = self._make_info(f"{self.SOURCE.kind} {stream.name}")
-        now = self._request.settings(self._sensor_px)
+        now = self._setup.settings(self._sensor_px)
         rate = self._measure_rate(stream) or now.frame_rate_hz
         self._settings = replace(now, frame_rate_hz=rate, exposure_s=min(now.exposure_s, 1 / rate))
 
