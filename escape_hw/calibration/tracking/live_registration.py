@@ -291,7 +291,8 @@ class LiveRegistration:
         return LiveEstimate(
             estimate, present.random_covariance[1:6, 1:6], gains, self._gains_sigma(present, timing_sigma),
             float(np.abs(present.innovation).max()), float(np.mean(np.square(residual))),
-            float(np.sqrt(block_sums.variance.mean())), state.actuator_gain.copy(), self._current_matrix, response,
+            float(np.sqrt(block_sums.variance.mean())), state.actuator_gain.copy(), self._current_matrix,
+            response,
         )  # fmt: skip
 
     def _extrapolate_to_now(
