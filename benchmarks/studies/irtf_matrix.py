@@ -23,9 +23,9 @@ from scipy import ndimage
 from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.procedure import run
 from escape_hw.api.registration import Registration
+from escape_hw.array_files import read_array
 from escape_hw.calibration.sprint.fit import fit_registration
 from escape_hw.io.documents import dumps
-from escape_hw.io.interchange.arrays import read_array
 from escape_hw.report.figures import style
 from escape_sim.mirror.influence_functions import MeasuredInfluenceFunctions
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from realisation_tables import study_parser
 
 from escape_hw.api.registration import Registration
+from escape_hw.array_files import read_array
 from escape_hw.calibration.modes.bases import build_basis
 from escape_hw.calibration.sprint.fit import sprint
 from escape_hw.config.loader import load_system
@@ -25,7 +26,6 @@ from escape_hw.io.interchange.arrays import (
     MatrixTable,
     SensorTable,
     import_arrays,
-    read_array,
 )
 from escape_hw.report.figures import style
 from escape_hw.report.figures.matrix import mode_maps
