@@ -33,13 +33,14 @@ from escape_hw.calibration.docrime.open_loop import (
     build_solution_matrix,
     collect_solution_notes,
     require_enough_frames,
+    solve_run,
 )
 from escape_hw.calibration.docrime.regression import MAX_CORRELATED_SLOPES
 from escape_hw.calibration.loop.control import build_integrator
 from escape_hw.calibration.loop.divergence import require_not_diverged
 from escape_hw.calibration.loop.performance import collect_loop_notes, select_settled_residual
 from escape_hw.calibration.loop.runner import LoopRecord, RunningLoop
-from escape_hw.errors import Aborted, ConfigError, TooFewFrames
+from escape_hw.errors import Aborted, ConfigError
 from escape_hw.io.fits.run_state import RunState
 
 #: Frames between two checks of the stopping criterion.
@@ -169,12 +170,7 @@ def docrime_closed_run(
         acquisition.restore(state)
     stage = f"{pattern.title} in closed loop"
     partial = yield from acquisition.poke(n_frames, pattern(amplitude, bench.rng), stage)
-    try:
-        solution = estimator.solve()
-    except TooFewFrames:
-        if partial:
-            raise Aborted(f"aborted after {estimator.frames_received} frames, too few for a matrix") from None
-        raise
+    solution = solve_run(estimator, partial, estimator.frames_received)
     record, skipped = acquisition.loop.record, acquisition.estimator_thread.skipped
     residual = select_settled_residual(record, bench.wfs.settings.frame_rate_hz)
     matrix = build_solution_matrix(
