@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 
@@ -42,6 +41,7 @@ from escape_hw.calibration.loop.performance import collect_loop_notes, select_se
 from escape_hw.calibration.loop.runner import LoopRecord, RunningLoop
 from escape_hw.errors import Aborted, ConfigError
 from escape_hw.io.fits.run_state import RunState
+from escape_hw.pipeline.statistics import root_mean_square
 
 #: Frames between two checks of the stopping criterion.
 _CHECK_INTERVAL = 500
@@ -176,7 +176,7 @@ def docrime_closed_run(
     matrix = build_solution_matrix(
         bench, grid, m2c, solution, method, poke=float(poke), clipped_pokes=record.shortened,
         skipped=skipped, loop_gain=bench.config.loop.gain,
-        loop_residual_nm=float(np.sqrt(np.mean(np.square(residual)))) if residual.size else math.nan,
+        loop_residual_nm=root_mean_square(residual),
     )  # fmt: skip
     seconds = (solution.frames + solution.lost_frames) / bench.wfs.settings.frame_rate_hz
     notes = [

@@ -40,7 +40,7 @@ from escape_hw.calibration.tracking.live_registration import (
 )
 from escape_hw.errors import Aborted, CalibrationError, ConfigError, TooFewFrames
 from escape_hw.pipeline.psf.frame_stack import FrameStack
-from escape_hw.pipeline.statistics import MIN_SAMPLES
+from escape_hw.pipeline.statistics import MIN_SAMPLES, root_mean_square
 
 #: Seconds between two updates of the registration.
 STEP_S = 1.0
@@ -341,7 +341,7 @@ def build_row(
         "optical_gain": float(gains.mean()), "optical_gain_sigma": float(gains_sigma.mean()),
         "misfit": live.misfit, "innovation": live.innovation, "noise": live.noise,
         "mismatch": update.proposal.evidence.mismatch,
-        "residual_nm": float(np.sqrt(np.mean(np.square(residual)))) if residual.size else math.nan,
+        "residual_nm": root_mean_square(residual),
         "strehl": update.strehl.value, "strehl_sigma": update.strehl.sigma, "exchanged": float(exchanged),
     }  # fmt: skip
 
