@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from escape_hw.errors import ProductError
-from escape_hw.io.run_folder import find_runs, read_result, run_label
+from escape_hw.io.run_folder import find_runs, read_result, run_label, run_time
 from escape_hw.report.tables import METHOD_LABELS
 from escape_hw.report.verdict import Quality, assess
 
@@ -65,7 +65,7 @@ def _summarise(folder: Path) -> RunSummary:
     method = str(document.get("method") or document.get("command") or "")
     return RunSummary(
         folder=folder,
-        date=f"{folder.parent.name} {folder.name[:2]}:{folder.name[2:4]}:{folder.name[4:6]}",
+        date=f"{folder.parent.name} {run_time(folder)}",
         name=run_label(folder),
         system=str(document.get("system", "")),
         method=METHOD_LABELS.get(method, method),

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from escape_gui.views.images import mask_from_rows
+from escape_hw.io.run_folder import run_time
 from escape_hw.remote.state import Geometry, RecordingState
 
 if TYPE_CHECKING:
@@ -73,7 +74,7 @@ def describe_growth(recording: RecordingState, seconds: float) -> str:
 
 def describe_analysis(analysis: TelemetryAnalysis, folder: Path | None) -> str:
     """Time of the recording, frames, and what is missing, in a line."""
-    time = "" if folder is None else f"{folder.name[:2]}:{folder.name[2:4]}:{folder.name[4:6]} · "
+    time = "" if folder is None else f"{run_time(folder)} · "
     lost = f", {analysis.n_lost} lost" if analysis.n_lost else ""
     missing = ""
     if not analysis.mode_psd.shape[1]:

@@ -13,6 +13,7 @@ from escape_gui.client.session import Session
 from escape_gui.views.telemetry import size_text
 from escape_gui.widgets.controls import set_available
 from escape_gui.window.browser import FolderBrowser
+from escape_hw.io.run_folder import run_time
 
 if TYPE_CHECKING:
     from escape_hw.runtime.session.recordings import RecordingSummary
@@ -50,8 +51,8 @@ class RecordingBrowser(FolderBrowser["RecordingSummary"]):
 
     @staticmethod
     def _cells(entry: RecordingSummary) -> Sequence[tuple[str, float | str]]:
-        name, about = entry.folder.name, entry.description
-        date = f"{entry.folder.parent.name} {name[:2]}:{name[2:4]}:{name[4:6]}"
+        about = entry.description
+        date = f"{entry.folder.parent.name} {run_time(entry.folder)}"
         loop = f"gain {about.gain:g}" if about.loop_closed else ("open" if about.started_utc else "")
         system = f"{about.system} (simulated)" if about.system and about.simulated else about.system
         streams = ", ".join(entry.streams)
