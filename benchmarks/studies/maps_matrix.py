@@ -12,6 +12,7 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
+from matrix_agreement import correlation
 from numpy.typing import NDArray
 from realisation_tables import study_parser
 
@@ -45,11 +46,6 @@ def illuminated(maps: NDArray[np.float64]) -> NDArray[np.bool_]:
     response = np.sqrt((maps.reshape(len(maps), n, 2, n) ** 2).mean(axis=(0, 2)))
     line = np.arange(n) - (n - 1) / 2
     return np.asarray((response > LEAST) & (np.hypot(line, line[:, None]) < ACROSS / 2))
-
-
-def correlation(a: NDArray[np.floating], b: NDArray[np.floating]) -> float:
-    """Correlation of two matrices about zero."""
-    return float(np.vdot(a, b) / np.sqrt(np.vdot(a, a) * np.vdot(b, b)))
 
 
 def main() -> None:
