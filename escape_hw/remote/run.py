@@ -5,23 +5,29 @@ from __future__ import annotations
 import time
 from contextlib import nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 from escape_hw.api.procedure import Progress
 from escape_hw.errors import Aborted, CalibrationError, ServerGone
+from escape_hw.remote.source import DataSource
 from escape_hw.remote.state import ActiveRun, Finish, FinishedRun
-
-if TYPE_CHECKING:
-    from escape_hw.remote.client import Connection
 
 #: Silence of a server after which waiting for a run ends.
 _SERVER_TIMEOUT_S = 15.0
 
 
+class RunSource(DataSource, Protocol):
+    """Connection to the server of a run."""
+
+    def wait_for(self, run: int, timeout_s: float) -> FinishedRun | None:
+        """The end of a run; ``None`` when it has not ended within the time-out."""
+        ...
+
+
 class RemoteRun:
     """A run on a server: its number ``id``, and the ``name`` of its procedure."""
 
-    def __init__(self, connection: Connection, id: int, name: str) -> None:
+    def __init__(self, connection: RunSource, id: int, name: str) -> None:
         self._connection, self.id, self.name = connection, id, name
         self._engine_pid = connection.state.engine_pid
 
