@@ -22,7 +22,7 @@ from PySide6.QtWidgets import (
     QWidget,
 )
 
-from escape_gui.client.alarms import AlarmMonitor
+from escape_gui.client.alarms import LimitMonitor
 from escape_gui.client.availability import tooltip
 from escape_gui.client.session import Session
 from escape_gui.panels import PANELS
@@ -84,19 +84,13 @@ class MainWindow(QMainWindow):
         theme = self.context.theme
         theme.apply()
         theme.changed.connect(self._resize_tabs)
-        self.setDockNestingEnabled(True)
-        self.setDockOptions(
-            QMainWindow.DockOption.AnimatedDocks
-            | QMainWindow.DockOption.AllowNestedDocks
-            | QMainWindow.DockOption.AllowTabbedDocks
-        )
-        self.setTabPosition(Qt.DockWidgetArea.AllDockWidgetAreas, QTabWidget.TabPosition.North)
+        self._allow_docks()
         self.actions_by_name = self._make_actions()
         self.header = HeaderBar(
             self.context, self.actions_by_name["open_loop"], self.actions_by_name["flatten"]
         )
         self.fault_banner = FaultBanner(self.context, self.actions_by_name["clear_fault"])
-        self.alarms = AlarmMonitor(settings.alarms, self._log_alarm)
+        self.alarms = LimitMonitor(settings.alarms, self._log_alarm)
         self.alarm_banner = AlarmBanner(self.context, self.actions_by_name["acknowledge"])
         self.alarm_dialog = AlarmDialog(self, settings)
         self.frozen_banner = FrozenBanner(self.context, self.actions_by_name["freeze"])
@@ -107,9 +101,7 @@ class MainWindow(QMainWindow):
         self._make_header()
         self._status_labels = {name: QLabel() for name in ("busy", "saved", "recording", "disk")}
         self.notifications = NotificationBar(theme)
-        self.statusBar().addWidget(self.notifications, 1)
-        for label in self._status_labels.values():
-            self.statusBar().addPermanentWidget(label)
+        self._fill_status_bar()
         self.overlay = Overlay(self, theme)
         self.state_notifier = StateNotifier(self.notifications)
         self.exporter = Exporter(
@@ -119,25 +111,13 @@ class MainWindow(QMainWindow):
         self.playback_bar = PlaybackBar(session)
         self.addToolBar(Qt.ToolBarArea.BottomToolBarArea, self.playback_bar)
         self.replay = RecordingOpener(self, session)
-        self.replay.opened.connect(self.show_recording)
-        self.replay.failed.connect(
-            lambda why: self.notifications.show_message(Level.ERROR, "Cannot be opened", why)
-        )
-        self.run_browser = RunBrowser(self, session)
-        self.run_browser.replay_requested.connect(self.replay.open)
-        loop = self.panels.get(LoopPanel.name)
-        if isinstance(loop, LoopPanel):
-            loop.load_button.clicked.connect(self.run_browser.open_list)
-            self.run_browser.matrix_loaded.connect(lambda product: loop.choose_matrix(product.name))
-        self.recording_browser = RecordingBrowser(self, session)
-        telemetry = self.panels.get(TelemetryPanel.name)
-        if isinstance(telemetry, TelemetryPanel):
-            telemetry.browse_button.clicked.connect(self.recording_browser.open_list)
-            self.recording_browser.opened.connect(telemetry.open_recording)
+        self.run_browser, self.recording_browser = RunBrowser(self, session), RecordingBrowser(self, session)
         self.camera_dialogs = {name: CameraDialog(self, session, theme, name) for name in ("wfs", "science")}
         self.offsets_dialog = OffsetsDialog(self, session, theme)
         self.connect_dialog = ConnectDialog(self, theme)
+        self._connect_browsers()
         self._connect_panels()
+        self._connect_session()
         #: Windows in which recorded runs were opened from this one.
         self.replay_windows: list[MainWindow] = []
         #: Whether this window started the server, and whether that server goes on without the window.
@@ -145,17 +125,50 @@ class MainWindow(QMainWindow):
         #: Open question before closing.
         self.close_question: CloseQuestion | None = None
         self._may_close = False
+        self.handlers = self._make_handlers()
+        self.workspace = workspace(settings.workspace)
+        self._restore()
+
+    # ------------------------------------------------------------ construction
+    def _allow_docks(self) -> None:
+        self.setDockNestingEnabled(True)
+        self.setDockOptions(
+            QMainWindow.DockOption.AnimatedDocks
+            | QMainWindow.DockOption.AllowNestedDocks
+            | QMainWindow.DockOption.AllowTabbedDocks
+        )
+        self.setTabPosition(Qt.DockWidgetArea.AllDockWidgetAreas, QTabWidget.TabPosition.North)
+
+    def _fill_status_bar(self) -> None:
+        self.statusBar().addWidget(self.notifications, 1)
+        for label in self._status_labels.values():
+            self.statusBar().addPermanentWidget(label)
+
+    def _connect_browsers(self) -> None:
+        """Connect what opens and shows runs and recordings."""
+        self.replay.opened.connect(self.show_recording)
+        self.replay.failed.connect(
+            lambda why: self.notifications.show_message(Level.ERROR, "Cannot be opened", why)
+        )
+        self.run_browser.replay_requested.connect(self.replay.open)
+        loop, telemetry = self.panels.get(LoopPanel.name), self.panels.get(TelemetryPanel.name)
+        if isinstance(loop, LoopPanel):
+            loop.load_button.clicked.connect(self.run_browser.open_list)
+            self.run_browser.matrix_loaded.connect(lambda product: loop.choose_matrix(product.name))
+        if isinstance(telemetry, TelemetryPanel):
+            telemetry.browse_button.clicked.connect(self.recording_browser.open_list)
+            self.recording_browser.opened.connect(telemetry.open_recording)
+
+    def _connect_session(self) -> None:
+        """Show failed and pending requests."""
+        session = self.context.session
         session.failed.connect(
             lambda what, why: self.notifications.show_message(Level.ERROR, f"Could not {what}", why)
         )
         session.pending_changed.connect(
             lambda n: self._set_status("busy", f"{n} request(s) pending" if n else "")
         )
-        self.handlers = self._make_handlers()
-        self.workspace = workspace(settings.workspace)
-        self._restore()
 
-    # ------------------------------------------------------------ construction
     def _connect_panels(self) -> None:
         """Connect panels with dialogs and with each other."""
         for panel in self.panels.values():
@@ -477,7 +490,7 @@ class MainWindow(QMainWindow):
             return
         self.update_timer.stop()
         self.replay.close()
-        self.run_browser.shut_down()
+        self.run_browser.hide()
         for other in self.replay_windows:
             other.close()
             other.context.session.close()

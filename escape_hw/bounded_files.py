@@ -41,5 +41,10 @@ def read_bounded(path: Path, limit: int) -> bytes:
     return content
 
 
+def shorten_path(path: str) -> str:
+    """A path for a message; the middle of a very long one is left out."""
+    return path if len(path) <= 300 else f"{path[:150]}...{path[-150:]}"
+
+
 def _too_large(path: Path, limit: int) -> OSError:
     return OSError(errno.EFBIG, f"larger than {limit / 1e6:.0f} MB, the most that is read", str(path))

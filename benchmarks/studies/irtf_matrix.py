@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matrix_agreement import correlation, remaining
 from numpy.typing import NDArray
 from realisation_tables import study_parser
 from scipy import ndimage
@@ -23,11 +24,11 @@ from scipy import ndimage
 from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.procedure import run
 from escape_hw.api.registration import Registration
+from escape_hw.array_files import read_array
 from escape_hw.calibration.sprint.fit import fit_registration
 from escape_hw.io.documents import dumps
-from escape_hw.io.interchange.arrays import read_array
 from escape_hw.report.figures import style
-from escape_sim.mirror.influence_functions import MeasuredInfluenceFunctions
+from escape_sim.mirror.measured import MeasuredInfluenceFunctions
 
 N_SUB = 12
 #: Residual relative to the least one below which orientations count as equally good.
@@ -109,12 +110,6 @@ def read_matrix(folder: Path, file: str) -> InteractionMatrix:
     )  # fmt: skip
 
 
-def remaining(measured: NDArray[np.floating], predicted: NDArray[np.floating]) -> float:
-    """Rms of the difference relative to the measured matrix, after the best common gain."""
-    gain = np.vdot(predicted, measured) / np.vdot(predicted, predicted)
-    return float(np.linalg.norm(measured - gain * predicted) / np.linalg.norm(measured))
-
-
 def fit(folder: Path) -> tuple[dict[str, Any], NDArray[np.float64], NDArray[np.float64]]:
     """Registrations of both days; the last measured matrix and its synthetic one."""
     surfaces, document = read_surfaces(folder), {}
@@ -168,9 +163,6 @@ def felix(folder: Path) -> tuple[dict[str, Any], NDArray[np.float64], dict[str, 
     others = {one.stem: np.asarray(read_array(one), float) for one in sorted(folder.glob("imat*.npy"))}
     mean, scatter = night.mean(axis=0), night.std(axis=0, ddof=1)
     rms = float(np.sqrt(np.square(mean).mean()))
-
-    def correlation(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
-        return float(np.vdot(a, b) / np.sqrt(np.vdot(a, a) * np.vdot(b, b)))
 
     pairs = [correlation(night[i], night[j]) for i in range(len(night)) for j in range(i)]
     signal_to_noise = np.sqrt(np.square(mean).mean(axis=0) / np.square(scatter).mean(axis=0))

@@ -12,10 +12,12 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
+from matrix_agreement import correlation
 from numpy.typing import NDArray
 from realisation_tables import study_parser
 
 from escape_hw.api.registration import Registration
+from escape_hw.array_files import read_array
 from escape_hw.calibration.modes.bases import build_basis
 from escape_hw.calibration.sprint.fit import sprint
 from escape_hw.config.loader import load_system
@@ -25,7 +27,6 @@ from escape_hw.io.interchange.arrays import (
     MatrixTable,
     SensorTable,
     import_arrays,
-    read_array,
 )
 from escape_hw.report.figures import style
 from escape_hw.report.figures.matrix import mode_maps
@@ -45,11 +46,6 @@ def illuminated(maps: NDArray[np.float64]) -> NDArray[np.bool_]:
     response = np.sqrt((maps.reshape(len(maps), n, 2, n) ** 2).mean(axis=(0, 2)))
     line = np.arange(n) - (n - 1) / 2
     return np.asarray((response > LEAST) & (np.hypot(line, line[:, None]) < ACROSS / 2))
-
-
-def correlation(a: NDArray[np.floating], b: NDArray[np.floating]) -> float:
-    """Correlation of two matrices about zero."""
-    return float(np.vdot(a, b) / np.sqrt(np.vdot(a, a) * np.vdot(b, b)))
 
 
 def main() -> None:

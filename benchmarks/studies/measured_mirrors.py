@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matrix_agreement import remaining
 from numpy.typing import NDArray
 from realisation_tables import append_line, read_lines, study_parser
 
@@ -40,12 +41,6 @@ _JUMP = 5.0
 _NAMED_CHANGE = 0.05
 #: Coupling of the nominal mirror, and the exponential (rounding, length in pitches) of the data's README.
 _COUPLING, _ROUNDING, _LENGTH = 0.4, 0.25, 0.90
-
-
-def remaining(measured: NDArray[np.float64], predicted: NDArray[np.float64]) -> float:
-    """Rms of the difference relative to the measured matrix, after the best common gain."""
-    gain = np.vdot(predicted, measured) / np.vdot(predicted, predicted)
-    return float(np.linalg.norm(measured - gain * predicted) / np.linalg.norm(measured))
 
 
 def loop_eigenvalues(measured: NDArray[np.float64], predicted: NDArray[np.float64]) -> tuple[float, float]:

@@ -72,7 +72,7 @@ RULES = (
 )
 
 
-class AlarmMonitor:
+class LimitMonitor:
     """Raises alarms from states; an alarm stays until it was acknowledged and its reason has passed.
 
     ``limits``: limit by name of the rule; rules without a limit are off. The mapping may change. ``on_event``

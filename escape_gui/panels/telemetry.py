@@ -25,7 +25,7 @@ from escape_gui.views.telemetry import (
     describe_growth,
     suspicious_rows,
 )
-from escape_gui.widgets.browser_table import Cell, browser_table
+from escape_gui.widgets.browser_table import SortableCell, browser_table
 from escape_gui.widgets.controls import SegmentedButton, caption, row, set_available, text_label
 from escape_gui.widgets.telemetry_plot import GainByModePlot, ResidualPlot, SpectraPlot
 from escape_hw.remote.source import DataSource
@@ -206,7 +206,7 @@ class TelemetryPanel(Panel):
         self.table.setRowCount(len(rows))
         for line, cells in enumerate(rows):
             for column, text in enumerate(cells):
-                self.table.setItem(line, column, Cell(text, text))
+                self.table.setItem(line, column, SortableCell(text, text))
 
     def tick(self, source: DataSource) -> None:
         if not source.connected:

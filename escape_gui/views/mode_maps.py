@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from escape_gui.views.images import slope_map_pair
 from escape_hw.api.interaction_matrix import InteractionMatrix, snr_per_mode
+from escape_hw.pipeline.statistics import root_mean_square
 
 #: Limits of the colour scale, in units of the mode's rms slope (as in the report's figure).
 LIMIT = 2.5
@@ -194,7 +195,7 @@ def tiles(matrices: Mapping[str, InteractionMatrix], mode: int) -> list[MapTile]
 
 def _slope_tile(label: str, matrix: InteractionMatrix, mode: int) -> MapTile:
     column = matrix.data[:, mode].astype(float)
-    rms = _rms(column)
+    rms = root_mean_square(column)
     snr = float(snr_per_mode(matrix.data[:, [mode]], matrix.sigma[:, [mode]])[0])
     with_errors = f", SNR {snr:.3g}" if np.isfinite(snr) else ""
     unit = "" if matrix.slope_unit == "1" else f" {matrix.slope_unit}"
@@ -212,11 +213,11 @@ def _difference_tile(
     both = np.isfinite(a) & np.isfinite(b)
     if not both.any():
         return []
-    rms_a, rms_b = (_rms(one[both]) or 1.0 for one in (a, b))
+    rms_a, rms_b = (root_mean_square(one[both]) or 1.0 for one in (a, b))
     difference = np.where(both, a / rms_a - b / rms_b, np.nan)
     correlation = float(np.mean(a[both] * b[both])) / (rms_a * rms_b)
     note = f"correlation {correlation:.3f}, relative gain {rms_a / rms_b:.2f}"
-    spread = 3 * _rms(difference[both])
+    spread = 3 * root_mean_square(difference[both])
     limit = next((one for one in _LIMITS if one >= spread), _LIMITS[-1])
     return [MapTile(f"{labels[0]} − {labels[1]}", note, difference, (-limit, limit), True)]
 
@@ -224,14 +225,14 @@ def _difference_tile(
 def _error_tiles(label: str, matrix: InteractionMatrix, mode: int) -> list[MapTile]:
     """Standard error relative to the rms slope, and ratio of slope to standard error."""
     column, sigma = matrix.data[:, mode].astype(float), matrix.sigma[:, mode].astype(float)
-    rms = _rms(column) or 1.0
+    rms = root_mean_square(column) or 1.0
     relative = sigma / rms
     top = float(np.nanmax(relative[np.isfinite(relative)], initial=0.0))
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = np.abs(column) / sigma
     middle = float(np.nanmedian(ratio))
     errors, ratios = slope_map_pair(relative, matrix.valid), slope_map_pair(ratio, matrix.valid)
-    note = f"1 σ, rms {_rms(sigma) / rms:.2g}"
+    note = f"1 σ, rms {root_mean_square(sigma) / rms:.2g}"
     return [
         MapTile(f"Standard error of {label}", note, errors, (0.0, _round_up(top)), False),
         MapTile(f"SNR of {label}", f"median {middle:.3g}", ratios, (0.0, _round_up(2 * middle)), False),
@@ -244,7 +245,3 @@ def _round_up(value: float) -> float:
         return 1.0
     decade = 10.0 ** np.floor(np.log10(value))
     return float(next(step for step in (1, 2, 5, 10) if step * decade >= value * (1 - 1e-9)) * decade)
-
-
-def _rms(values: NDArray[np.float64]) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from escape_hw.errors import ProductError
-from escape_hw.io.run_folder import find_runs, read_result, run_label
+from escape_hw.io.run_folder import find_runs, read_result, run_label, run_time
 from escape_hw.report.tables import METHOD_LABELS
 from escape_hw.report.verdict import Quality, assess
 
@@ -38,19 +38,15 @@ class RunSummary:
     simulated: bool
 
     @property
-    def cells(self) -> tuple[str, ...]:
-        """Texts of :data:`COLUMNS`."""
+    def cells(self) -> list[tuple[str, float | str]]:
+        """Text and value for sorting of each of :data:`COLUMNS`."""
         system = f"{self.system} (simulated)" if self.simulated else self.system
-        return (
-            self.date, self.name, system, self.method,
-            f"{self.frames:,}" if self.frames else "", self.quality.text if self.quality is not None else "",
-            f"{self.size_mb:.1f} MB",
-        )  # fmt: skip
-
-    def matches(self, words: str) -> bool:
-        """Whether all words occur in the row."""
-        text = " ".join((*self.cells, self.verdict)).lower()
-        return all(word in text for word in words.lower().split())
+        quality = ("", -1) if self.quality is None else (self.quality.text, self.quality)
+        return [
+            (self.date, self.date), (self.name, self.name), (system, self.system), (self.method, self.method),
+            (f"{self.frames:,}" if self.frames else "", self.frames), quality,
+            (f"{self.size_mb:.1f} MB", self.size_mb),
+        ]  # fmt: skip
 
 
 def read_runs(runs: Path) -> Iterator[RunSummary]:
@@ -69,7 +65,7 @@ def _summarise(folder: Path) -> RunSummary:
     method = str(document.get("method") or document.get("command") or "")
     return RunSummary(
         folder=folder,
-        date=f"{folder.parent.name} {folder.name[:2]}:{folder.name[2:4]}:{folder.name[4:6]}",
+        date=f"{folder.parent.name} {run_time(folder)}",
         name=run_label(folder),
         system=str(document.get("system", "")),
         method=METHOD_LABELS.get(method, method),

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from escape_gui.views.images import mask_from_rows
+from escape_hw.io.run_folder import run_time
 from escape_hw.remote.state import Geometry, RecordingState
 
 if TYPE_CHECKING:
@@ -52,12 +53,16 @@ class Spectra:
         )  # fmt: skip
 
 
+def size_text(size: float) -> str:
+    """A number of bytes in MB or GB."""
+    return f"{size / 1e9:,.2f} GB" if size >= 1e9 else f"{size / 1e6:,.1f} MB"
+
+
 def describe_growth(recording: RecordingState, seconds: float) -> str:
     """Progress or end of a recording in a line."""
     if not recording.path:
         return "no recording yet"
-    size = f"{recording.size / 1e6:,.1f} MB" if recording.size < 1e9 else f"{recording.size / 1e9:,.2f} GB"
-    parts = [f"{recording.written:,} entries", size]
+    parts = [f"{recording.written:,} entries", size_text(recording.size)]
     if recording.recording:
         parts.insert(0, f"{seconds:,.0f} s")
     if recording.dropped:
@@ -69,7 +74,7 @@ def describe_growth(recording: RecordingState, seconds: float) -> str:
 
 def describe_analysis(analysis: TelemetryAnalysis, folder: Path | None) -> str:
     """Time of the recording, frames, and what is missing, in a line."""
-    time = "" if folder is None else f"{folder.name[:2]}:{folder.name[2:4]}:{folder.name[4:6]} · "
+    time = "" if folder is None else f"{run_time(folder)} · "
     lost = f", {analysis.n_lost} lost" if analysis.n_lost else ""
     missing = ""
     if not analysis.mode_psd.shape[1]:

@@ -8,7 +8,7 @@ from PySide6.QtCore import Qt
 from PySide6.QtWidgets import QAbstractItemView, QHeaderView, QTableWidget, QTableWidgetItem
 
 
-class Cell(QTableWidgetItem):
+class SortableCell(QTableWidgetItem):
     """A cell that is sorted by its value."""
 
     def __init__(self, text: str, value: float | str) -> None:
@@ -17,11 +17,11 @@ class Cell(QTableWidgetItem):
         self.setFlags(Qt.ItemFlag.ItemIsSelectable | Qt.ItemFlag.ItemIsEnabled)
 
     def __lt__(self, other: QTableWidgetItem) -> bool:
-        return isinstance(other, Cell) and self._value < other._value  # type: ignore[operator]
+        return isinstance(other, SortableCell) and self._value < other._value  # type: ignore[operator]
 
 
 def browser_table(headings: Sequence[str], name: str) -> QTableWidget:
-    """An empty table of :class:`Cell` with these headings."""
+    """An empty table of :class:`SortableCell` with these headings."""
     table = QTableWidget(0, len(headings))
     table.setHorizontalHeaderLabels(list(headings))
     table.setSelectionBehavior(QAbstractItemView.SelectionBehavior.SelectRows)

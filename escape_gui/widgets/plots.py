@@ -62,9 +62,9 @@ class Plot(pg.PlotWidget):  # type: ignore[misc]
         self._curves.append((item, number, alone))
         return item
 
-    def pin_left_axis(self, characters: int = 6) -> None:
+    def pin_left_axis(self) -> None:
         """Fix the width of the left axis, so that plots above each other are aligned."""
-        self.getAxis("left").setWidth(self._theme.pixels(9 * characters))
+        self.getAxis("left").setWidth(self._theme.pixels(54))
 
     def hide_bottom_label(self) -> None:
         del self._labels["bottom"]
@@ -113,7 +113,7 @@ class SectionPlot(Plot):
 class StripChart(Plot):
     """A quantity over the last ``span_s`` seconds."""
 
-    def __init__(self, theme: Theme, name: str, y: str, span_s: float = 120.0, number: int = 0) -> None:
+    def __init__(self, theme: Theme, name: str, y: str, number: int = 0) -> None:
         super().__init__(theme, name, "time before now [s]", y)
         self._line = self.curve(number, alone=True, connect="finite")
         # Room for the upper half of the highest tick label.
@@ -122,7 +122,7 @@ class StripChart(Plot):
         self._line.setDownsampling(auto=True, method="peak")
         self.getPlotItem().enableAutoRange(axis="y")
         self.pin_left_axis()
-        self.set_span(span_s)
+        self.set_span(120.0)
 
     def set_span(self, span_s: float) -> None:
         """Show the last ``span_s`` seconds, in seconds, minutes or hours."""

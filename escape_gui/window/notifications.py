@@ -62,15 +62,15 @@ class NotificationBar(QWidget):
         for one in [one for one in self.notifications if one.title == title]:
             self._remove(one)
 
-    def show_message(self, level: Level, title: str, text: str, *, persistent: bool | None = None) -> None:
-        """Show a notification for :data:`DISPLAY_MS`; if ``persistent`` (default: errors), until closed."""
+    def show_message(self, level: Level, title: str, text: str) -> None:
+        """Show a notification for :data:`DISPLAY_MS`; an error until it is closed."""
         while len(self.notifications) >= _MAX_NOTIFICATIONS:
             self._remove(self.notifications[0])
         new = Notification(self._theme, level, title, text)
         new.close_button.clicked.connect(lambda: self._remove(new))
         self.notifications.append(new)
         self._row.insertWidget(0, new, 1)
-        if not (level is Level.ERROR if persistent is None else persistent):
+        if level is not Level.ERROR:
             timer = QTimer(new)
             timer.setSingleShot(True)
             timer.timeout.connect(lambda: self._remove(new))

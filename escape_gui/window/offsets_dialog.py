@@ -20,6 +20,17 @@ _NOTE = (
     "Nanometres rms wavefront, added to the mirror at rest and to the shape that a closed loop converges to: "
     "non-common-path aberrations are corrected here."
 )
+#: Text and tooltip of every button.
+_BUTTONS = {
+    "apply": ("Apply", "Move the mirror at rest, and the shape that a closed loop converges to."),
+    "zero": ("Clear all", "Set tip, tilt, focus and all modes to zero."),
+    "present_slopes": ("Use present slopes", "Average the slopes for 2 s; the loop keeps them so."),
+    "clear_slopes": ("Clear", "Use the reference slopes of the matrix."),
+    "present_shape": ("Use present shape", "The present shape of the mirror becomes its flat."),
+    "clear_flat": ("Clear", "Flat is a command of zeros."),
+    "load": ("Restore", "Restore the saved offsets."),
+    "save": ("Save", "Save the present offsets on the server."),
+}
 
 
 class OffsetsDialog(QDialog):
@@ -38,38 +49,13 @@ class OffsetsDialog(QDialog):
         self.mode_number.setAccessibleName("Number of the mode")
         self.mode_number.edited.connect(self._show_mode)
         self.current = {name: caption("0.0") for name in self.fields}
-        grid = QGridLayout()
-        for k, text in ((2, "Current"), (3, "Setpoint")):
-            grid.addWidget(caption(text), 0, k)
-        for line, (name, field) in enumerate(self.fields.items(), 1):
-            field.setAccessibleName(f"{name} setpoint")
-            field.lineEdit().returnPressed.connect(self.apply)
-            grid.addWidget(caption(name), line, 0)
-            grid.addWidget(self.current[name], line, 2)
-            grid.addWidget(field, line, 3)
-            grid.addWidget(caption("nm rms"), line, 4)
-        grid.addWidget(self.mode_number, len(self.fields), 1)
         self.references, self.flat = caption(), caption()
         self.saved, self.name = QComboBox(), QLineEdit()
         self.saved.setAccessibleName("Saved offsets")
         self.name.setPlaceholderText("name")
         self.name.setAccessibleName("Name under which the offsets are saved")
         self.name.textEdited.connect(lambda _: self.update_buttons())
-        texts = {
-            "apply": (
-                "Apply",
-                "Move the mirror at rest, and the shape that a closed loop converges to.",
-            ),
-            "zero": ("Clear all", "Set tip, tilt, focus and all modes to zero."),
-            "present_slopes": ("Use present slopes", "Average the slopes for 2 s; the loop keeps them so."),
-            "clear_slopes": ("Clear", "Use the reference slopes of the matrix."),
-            "present_shape": ("Use present shape", "The present shape of the mirror becomes its flat."),
-            "clear_flat": ("Clear", "Flat is a command of zeros."),
-            "load": ("Restore", "Restore the saved offsets."),
-            "save": ("Save", "Save the present offsets on the server."),
-        }
-        self.buttons = {name: QPushButton(text) for name, (text, _) in texts.items()}
-        self._tips = {name: tip for name, (_, tip) in texts.items()}
+        self.buttons = {name: QPushButton(text) for name, (text, _) in _BUTTONS.items()}
         close = QPushButton("Close")
         handlers: dict[str, Callable[[], object]] = {
             "apply": self.apply, "zero": self._clear_terms,
@@ -86,13 +72,28 @@ class OffsetsDialog(QDialog):
         note.setText(_NOTE)
         b = self.buttons
         column(
-            note, grid, row(b["apply"], b["zero"], None),
+            note, self._make_grid(), row(b["apply"], b["zero"], None),
             row(self.references, None, b["present_slopes"], b["clear_slopes"]),
             row(self.flat, None, b["present_shape"], b["clear_flat"]),
             row((self.saved, 1), b["load"]), row((self.name, 1), b["save"]), self.message, row(None, close),
             parent=self,
         ).setContentsMargins(16, 16, 16, 16)  # fmt: skip
         theme.follow(self._apply_theme)
+
+    def _make_grid(self) -> QGridLayout:
+        """A line for each term: name, number of the mode, present value, setpoint, unit."""
+        grid = QGridLayout()
+        for k, text in ((2, "Current"), (3, "Setpoint")):
+            grid.addWidget(caption(text), 0, k)
+        for line, (name, field) in enumerate(self.fields.items(), 1):
+            field.setAccessibleName(f"{name} setpoint")
+            field.lineEdit().returnPressed.connect(self.apply)
+            grid.addWidget(caption(name), line, 0)
+            grid.addWidget(self.current[name], line, 2)
+            grid.addWidget(field, line, 3)
+            grid.addWidget(caption("nm rms"), line, 4)
+        grid.addWidget(self.mode_number, len(self.fields), 1)
+        return grid
 
     def open_offsets(self) -> None:
         """Show the present offsets."""
@@ -181,7 +182,7 @@ class OffsetsDialog(QDialog):
             "save": "" if self.name.text().strip() else "give a name",
         }
         for name, button in self.buttons.items():
-            set_available(button, self._tips[name], why or missing.get(name, ""))
+            set_available(button, _BUTTONS[name][1], why or missing.get(name, ""))
 
     def _show(self, state: OffsetsState) -> None:
         self._shown = state

@@ -46,22 +46,19 @@ def describe_value(value: object) -> str:
 
 #: Blue, white and red of a symmetric colour map (ends of Moreland's cool-warm), colour-blind safe.
 _COLOUR_STOPS = np.array([[59, 76, 192], [242, 242, 242], [180, 4, 38]], float)
+#: Width of images and lines, and height of lines, pixels.
+_WIDTH, _LINE_HEIGHT = 240, 48
 
 
-def image_html(values: ArrayLike, width: int = 240) -> str:
-    """A signed array as an ``<img>`` element; zero is white, NaN grey.
+def image_html(values: ArrayLike) -> str:
+    """A signed array ``(rows, columns)`` as an ``<img>`` element; zero is white, NaN grey.
 
-    Parameters
-    ----------
-    values
-        ``(rows, columns)``; subsampled if larger than the image.
-    width
-        Width in pixels.
+    It is subsampled if it is larger than the image.
     """
     from matplotlib.image import imsave
 
     image = np.atleast_2d(np.asarray(values, float))
-    image = image[:: max(1, image.shape[0] // width), :: max(1, image.shape[1] // width)]
+    image = image[:: max(1, image.shape[0] // _WIDTH), :: max(1, image.shape[1] // _WIDTH)]
     finite = np.isfinite(image)
     top = float(np.percentile(np.abs(image[finite]), 99)) if finite.any() else 0.0
     level = np.clip(np.where(finite, image, 0.0) / (top or 1.0), -1, 1) + 1
@@ -72,25 +69,25 @@ def image_html(values: ArrayLike, width: int = 240) -> str:
     imsave(png, colours.astype(np.uint8), format="png")
     data = base64.b64encode(png.getvalue()).decode()
     # A tall matrix is compressed to a square to fit on the page.
-    height = min(round(width * image.shape[0] / image.shape[1]), width)
+    height = min(round(_WIDTH * image.shape[0] / image.shape[1]), _WIDTH)
     return (
-        f'<img src="data:image/png;base64,{data}" width="{width}" height="{height}" '
+        f'<img src="data:image/png;base64,{data}" width="{_WIDTH}" height="{height}" '
         'style="image-rendering:pixelated"/>'
     )
 
 
-def line_html(values: ArrayLike, width: int = 240, height: int = 48) -> str:
+def line_html(values: ArrayLike) -> str:
     """A series as an ``<svg>`` line scaled to the height."""
     y = np.asarray(values, float).ravel()
     y = y[np.isfinite(y)]
     if y.size < 2:
         return ""
     low, high = float(y.min()), float(y.max())
-    x = np.linspace(1, width - 1, y.size)
-    at = height - 1 - (height - 2) * (y - low) / ((high - low) or 1.0)
+    x = np.linspace(1, _WIDTH - 1, y.size)
+    at = _LINE_HEIGHT - 1 - (_LINE_HEIGHT - 2) * (y - low) / ((high - low) or 1.0)
     points = " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(x, at, strict=True))
     return (
-        f'<svg width="{width}" height="{height}" role="img"><polyline points="{points}" fill="none" '
+        f'<svg width="{_WIDTH}" height="{_LINE_HEIGHT}" role="img"><polyline points="{points}" fill="none" '
         'stroke="#0072b2" stroke-width="1.2"/></svg>'
     )
 

@@ -21,6 +21,7 @@ import typer
 from rich.console import Console, RenderableType
 
 from escape_hw.api.concurrency import SignalSafeFlag
+from escape_hw.bounded_files import shorten_path
 from escape_hw.deprecation import RenamedWarning
 from escape_hw.errors import Aborted, ConfigError, EscapeError, StorageError
 from escape_hw.runtime.display.console import DisplayConsole
@@ -347,7 +348,7 @@ class CommandContext:
             # A library that is being imported may turn the interruption into an error of its own.
             return ABORTED, "Aborted", f"interrupted by Ctrl-C ({type(error).__name__})"
         if _is_file_error(error):
-            message = f"{_shorten(os.fsdecode(error.filename))}: {error.strerror or error}"
+            message = f"{shorten_path(os.fsdecode(error.filename))}: {error.strerror or error}"
             return (FAILED if self.devices_opened else USAGE), "StorageError", message
         message = f"{type(error).__name__}: {error} (this is a defect of ESCAPE)"
         if self.folder is not None and self.folder.path.is_dir():
@@ -370,11 +371,6 @@ class CommandContext:
 def _is_file_error(error: BaseException) -> TypeGuard[OSError]:
     """Whether a file or folder of this computer is the cause, such as an unreadable home directory."""
     return isinstance(error, OSError) and error.filename is not None
-
-
-def _shorten(path: str, length: int = 300) -> str:
-    """A path for a message; the middle of a very long one is left out."""
-    return path if len(path) <= length else f"{path[: length // 2]}...{path[-length // 2 :]}"
 
 
 @contextmanager

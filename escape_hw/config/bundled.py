@@ -6,7 +6,7 @@ import importlib.resources
 import os
 from pathlib import Path
 
-from escape_hw.bounded_files import MAX_TEXT_BYTES, read_bounded
+from escape_hw.bounded_files import MAX_TEXT_BYTES, read_bounded, shorten_path
 from escape_hw.config.key_tree import closest_match
 from escape_hw.errors import ConfigError
 
@@ -62,6 +62,5 @@ def find_system(system: str | os.PathLike[str]) -> tuple[str, str]:
     except UnicodeDecodeError as error:
         raise ConfigError(f"{name}: is not UTF-8 text ({error.reason} at byte {error.start})") from error
     except (OSError, ValueError) as error:
-        shown = name if len(name) <= 300 else f"{name[:150]}...{name[-150:]}"
         reason = error.strerror if isinstance(error, OSError) else error
-        raise ConfigError(f"{shown}: cannot be read ({reason})") from error
+        raise ConfigError(f"{shorten_path(name)}: cannot be read ({reason})") from error

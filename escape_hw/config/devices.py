@@ -266,16 +266,10 @@ class MirrorConfig(DeviceConfig):
             return self.layout
         return "points:" + ";".join(f"{x:.9g},{y:.9g}" for x, y in self.positions().tolist())
 
-    def info(self, model: str, *, simulated: bool, serial: str = "") -> DMInfo:
-        """Identity and nominal geometry for a driver or twin; ``serial`` is by default as configured."""
-        return mirror_info(
-            self.layout_in_pitches(),
-            self.pitch_m,
-            self.stroke_m,
-            model,
-            serial or self.serial,
-            simulated=simulated,
-        )
+    def info(self, model: str, *, simulated: bool) -> DMInfo:
+        """Identity and nominal geometry for a driver or twin."""
+        layout = self.layout_in_pitches()
+        return mirror_info(layout, self.pitch_m, self.stroke_m, model, self.serial, simulated=simulated)
 
     @model_validator(mode="after")
     def _rules(self) -> Self:

@@ -179,18 +179,10 @@ def _read_table(name: str, what: str = "table of positions") -> list[list[float]
 
 
 def _decode_table(content: bytes) -> Any:
-    import io
+    if content.startswith((b"\x93NUMPY", b"SIMPLE")):
+        from escape_hw.array_files import decode_array
 
-    import numpy as np
-
-    if content.startswith(b"\x93NUMPY"):
-        return np.load(io.BytesIO(content), allow_pickle=False)
-    if content.startswith(b"SIMPLE"):
-        from astropy.io import fits
-
-        with fits.open(io.BytesIO(content), memmap=False) as hdus:
-            images = (hdu.data for hdu in hdus if hdu.is_image and hdu.data is not None)
-            return np.array(next(data for data in images if data.ndim == 2), dtype=np.float64)
+        return decode_array(content, n_axes=2)
     lines = [line.partition("#")[0].replace(",", " ") for line in content.decode("utf-8").splitlines()]
     rows = [line.split() for line in lines if line.strip()]
     # A mask may be written without spaces.
@@ -279,7 +271,13 @@ def positions(layout: str) -> NDArray[np.float64]:
     points = _parse(layout).points
     if points is not None:
         return np.array(points)
-    grid = layout_map(layout)
+    return grid_positions(layout_map(layout))
+
+
+def grid_positions(grid: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Positions ``(n_act, 2)`` (x, y) of the actuators of a map, row by row, in pitches from its centre."""
+    import numpy as np
+
     rows, columns = np.nonzero(grid)
     return np.stack([columns, rows], axis=1) - (np.array(grid.shape[::-1]) - 1) / 2
 

@@ -56,6 +56,11 @@ def last_run_number(runs: Path, system: str) -> int:
     )
 
 
+def run_time(folder: Path) -> str:
+    """Time at which a run or recording began, by the name of its folder: ``21:45:30``."""
+    return ":".join(folder.name[k : k + 2] for k in (0, 2, 4))
+
+
 def run_label(folder: Path) -> str:
     """Name of a run for people: ``docrime-17`` for a server's run, else ``2026-11-22 214530 docrime``."""
     name = _RUN_NAME.fullmatch(folder.name)

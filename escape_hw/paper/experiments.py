@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 
 from escape_hw.api.procedure import Procedure
 from escape_hw.api.representation import short_repr
@@ -87,10 +88,8 @@ def reproduce_shwfs(
         For the number of modes; nothing moved.
     """
 
-    def steps(result: CalibrationComparison) -> Procedure[None]:
-        yield from measure_matrices(bench, frames, result)
-        if not result.partial:
-            yield from _close_loops(bench, loop_frames, result)
+    def evaluate(result: CalibrationComparison) -> Procedure[None]:
+        yield from _close_loops(bench, loop_frames, result)
         if realisations and not result.partial:
             from escape_hw.paper.sky_time import sky_time
 
@@ -100,19 +99,24 @@ def reproduce_shwfs(
                 # The other results do not depend on it.
                 result.notes.append(f"no curve of error against frames: {error}")
 
-    return (yield from _comparison(bench, frames, steps))
+    return (yield from _compare(bench, frames, partial(measure_matrices, bench, frames), evaluate))
 
 
-def _comparison(
-    bench: Bench, frames: int, steps: Callable[[CalibrationComparison], Procedure[None]]
+def _compare(
+    bench: Bench,
+    frames: int,
+    measure: Callable[[CalibrationComparison], Procedure[None]],
+    evaluate: Callable[[CalibrationComparison], Procedure[None]],
 ) -> Procedure[CalibrationComparison]:
-    """Check the frames before anything moves, and run steps that add to a comparison."""
+    """Check the frames before anything moves, measure matrices, and evaluate them unless that was aborted."""
     from escape_hw.calibration.docrime.open_loop import require_enough_frames
 
     require_enough_frames(bench.config.calibration, frames, bench.config.basis.n_modes)
     result = CalibrationComparison()
     try:
-        yield from steps(result)
+        yield from measure(result)
+        if not result.partial:
+            yield from evaluate(result)
     except Aborted:
         result.partial = True
     return result
@@ -156,13 +160,9 @@ def reproduce_pywfs(
     CalibrationError
         No gain gives a stable loop.
     """
-
-    def steps(result: CalibrationComparison) -> Procedure[None]:
-        yield from measure_matrices(bench, frames, result, common_geometry=True)
-        if not result.partial:
-            yield from _gains_and_loops(bench, closed_frames, loop_frames, result)
-
-    return (yield from _comparison(bench, frames, steps))
+    measure = partial(measure_matrices, bench, frames, common_geometry=True)
+    evaluate = partial(_gains_and_loops, bench, closed_frames, loop_frames)
+    return (yield from _compare(bench, frames, measure, evaluate))
 
 
 def _gains_and_loops(
@@ -210,13 +210,8 @@ def reproduce_revolt(
     CalibrationError
         No gain gives a stable loop.
     """
-
-    def steps(result: CalibrationComparison) -> Procedure[None]:
-        yield from measure_matrices(bench, frames, result, common_geometry=True)
-        if not result.partial:
-            yield from _close_loops(bench, loop_frames, result)
-
-    return (yield from _comparison(bench, frames, steps))
+    measure = partial(measure_matrices, bench, frames, common_geometry=True)
+    return (yield from _compare(bench, frames, measure, partial(_close_loops, bench, loop_frames)))
 
 
 def reproduce_maps(
@@ -250,17 +245,19 @@ def reproduce_maps(
     """
     from escape_hw.calibration.sprint.synthetic_matrix import nominal_calibration
 
-    def steps(result: CalibrationComparison) -> Procedure[None]:
+    def measure(result: CalibrationComparison) -> Procedure[None]:
         found = yield from calibrate_with_method(bench, "escape", frames=frames)
         result.partial = found.partial
         measured = found if found.partial else measured_calibration(found)
         if measured is not None:
             result.calibrations["DO-CRIME"] = measured
-        if found.partial:
-            return
-        result.calibrations["ESCAPE"] = found
+        if not found.partial:
+            result.calibrations["ESCAPE"] = found
+
+    def evaluate(result: CalibrationComparison) -> Procedure[None]:
         yield from _close_loops(bench, loop_frames, result)
         if not result.partial:
+            found = result.calibrations["ESCAPE"]
             result.calibrations["simulation"] = nominal_calibration(bench, found.grid, found.matrix.m2c)
 
-    return (yield from _comparison(bench, frames, steps))
+    return (yield from _compare(bench, frames, measure, evaluate))

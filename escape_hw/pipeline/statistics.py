@@ -1,4 +1,4 @@
-"""Standard error of the mean of correlated series, and paired bootstrap comparison of two means."""
+"""Root mean square, standard error of the mean of correlated series, and paired comparison of two means."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 #: Fewest values from which a correlation is estimated.
 MIN_SAMPLES = 10
@@ -17,6 +17,12 @@ _WOLFF_S = 1.5
 _MIN_WINDOW_FACTOR = 3.0
 #: Lower limit of the variance, as a share of that of uncorrelated values.
 _MIN_VARIANCE_FRACTION = 0.5
+
+
+def root_mean_square(values: ArrayLike) -> float:
+    """Root mean square of all values; NaN without values."""
+    squares = np.square(values)
+    return float(np.sqrt(np.mean(squares))) if squares.size else math.nan
 
 
 def standard_error(series: NDArray[np.floating]) -> float:

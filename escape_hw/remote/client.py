@@ -1,4 +1,4 @@
-"""Connection to a server: state, streams, log, control, and runs started through it."""
+"""Connection to a server: state, streams, log, control."""
 
 from __future__ import annotations
 
@@ -13,40 +13,36 @@ import time
 import uuid
 from collections import deque
 from collections.abc import Mapping, Sequence
-from contextlib import nullcontext
 from itertools import takewhile
 from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
 
-from escape_hw.api.procedure import Progress
 from escape_hw.deprecation import renamed_members
-from escape_hw.errors import Aborted, CalibrationError, ClientUnknown, EscapeError, ServerFull, ServerGone
+from escape_hw.errors import ClientUnknown, EscapeError, ServerFull, ServerGone
 from escape_hw.io.night_log import NightEntry
 from escape_hw.remote import requests as ask
 from escape_hw.remote.address import Endpoint, resolve
+from escape_hw.remote.device_requests import DeviceRequests
 from escape_hw.remote.keys import client_keys, keys_hint
+from escape_hw.remote.run import RemoteRun
 from escape_hw.remote.source import Sample, present_stream
 from escape_hw.remote.state import (
     SCHEMA,
     ActiveRun,
     Arguments,
-    CameraPlan,
-    Finish,
     FinishedRun,
     Geometry,
     Lease,
     LogLine,
-    OffsetsState,
     Phase,
-    PokePlan,
     ProcedureEntry,
     ProcedurePlan,
     ProductEntry,
     State,
 )
-from escape_hw.remote.transport import ClientTransport
+from escape_hw.remote.transport import SLOW_TIMEOUT_S, TIMEOUT_S, ClientTransport
 from escape_hw.runtime.procedures.calibration import EscapeProcedure
 from escape_hw.runtime.procedures.declaration import present_names
 from escape_hw.runtime.procedures.python_method import procedure_method
@@ -55,121 +51,6 @@ from escape_hw.streams.ring import ReaderCache
 
 log = logging.getLogger(__name__)
 
-#: Silence of a server after which waiting for a run ends.
-_SERVER_TIMEOUT_S = 15.0
-
-
-class RemoteRun:
-    """A run on a server: its number ``id``, and the ``name`` of its procedure."""
-
-    def __init__(self, connection: Connection, id: int, name: str) -> None:
-        self._connection, self.id, self.name = connection, id, name
-        self._engine_pid = connection.state.engine_pid
-
-    def __repr__(self) -> str:
-        ended = self.ended
-        return f"<run {self.id}: {self.name}, {'running' if ended is None else ended.finish.value}>"
-
-    @property
-    def ended(self) -> FinishedRun | None:
-        """The finished run; ``None`` while it runs."""
-        return self._connection.wait_for(self.id, 0.0)
-
-    @property
-    def running(self) -> ActiveRun | None:
-        """Progress; ``None`` when it has ended."""
-        running = self._connection.state.active_run
-        return running if running is not None and running.id == self.id else None
-
-    def wait(self, timeout_s: float | None = None, progress: bool = False) -> Any:
-        """Wait for the end and load the result.
-
-        Parameters
-        ----------
-        timeout_s
-            Longest wait; unlimited by default.
-        progress
-            Show a bar with the time left, in a terminal or a notebook.
-
-        Returns
-        -------
-        CalibrationResult, LoopResult, GainsResult or dict
-            The procedure's result, or the run's document when it has no product that this computer can read.
-
-        Raises
-        ------
-        Aborted
-            The run was aborted; ``partial`` holds the data measured so far, if any.
-        CalibrationError
-            The run failed.
-        TimeoutError
-            The run continues.
-        ServerGone
-            The server has been silent for too long.
-        """
-        from escape_hw.runtime.display.console import DisplayConsole
-        from escape_hw.runtime.display.progress import ProgressView
-
-        deadline = None if timeout_s is None else time.monotonic() + timeout_s
-        last_message_s = time.monotonic()
-        with ProgressView(DisplayConsole()) if progress else nullcontext() as view:
-            while (ended := self._connection.wait_for(self.id, 0.2)) is None:
-                now = time.monotonic()
-                last_message_s = now if self._connection.connected else last_message_s
-                if now - last_message_s > _SERVER_TIMEOUT_S:
-                    raise ServerGone(
-                        f"run {self.id}: its server has been silent for {now - last_message_s:.0f} s"
-                    )
-                if deadline is not None and now > deadline:
-                    raise TimeoutError(
-                        f"run {self.id} ({self.name}) has not ended within {timeout_s:g} s; it continues"
-                    )
-                self._require_engine()
-                if view is not None and (running := self.running) is not None:
-                    view(
-                        Progress(
-                            running.stage, running.completed, running.total, running.unit, running.elapsed_s,
-                            running.metrics,
-                        )
-                    )  # fmt: skip
-        return self._result(ended)
-
-    def _require_engine(self) -> None:
-        """Raise when the engine has died, which ends its run without a further message."""
-        state = self._connection.state
-        if state.engine_pid:
-            if self._engine_pid in (0, state.engine_pid):
-                return
-            reason = " / ".join(state.notes) or f"process {state.engine_pid} replaces it"
-        elif state.fault is not None:
-            reason = state.fault.reason
-        else:
-            return
-        if self._connection.wait_for(self.id, 0.0) is None:
-            raise CalibrationError(f"run {self.id} ({self.name}) ended with its engine: {reason}")
-
-    def _result(self, ended: FinishedRun) -> Any:
-        if ended.finish is Finish.FAILED:
-            raise CalibrationError(f"run {self.id} ({self.name}): {ended.message}")
-        result = load_result(ended)
-        if ended.finish is Finish.ABORTED:
-            raise Aborted(f"run {self.id} ({self.name}): {ended.message}", result)
-        return result
-
-
-def load_result(ended: FinishedRun) -> Any:
-    """Load the result of a run from its product, or its document when no product can be read here."""
-    from escape_hw.io.fits.gains import load_gains
-    from escape_hw.io.fits.loop import load_loop
-    from escape_hw.io.fits.matrix import load_matrix
-
-    loaders = {"gains": load_gains, "loop": load_loop, "im": load_matrix}
-    for key, load in loaders.items():
-        path = ended.products.get(key)
-        if path is not None and Path(path).is_file():
-            return load(path).result  # type: ignore[attr-defined]
-    return ended.document or None
-
 
 def _program() -> str:
     """Default name of this client: the name of its script, or ``notebook``."""
@@ -177,8 +58,6 @@ def _program() -> str:
     return "notebook" if name.startswith("ipykernel") else name or "python"
 
 
-#: Longest wait for an ordinary reply, and for one that is sent when the mirror is flat, seconds.
-TIMEOUT_S, SLOW_TIMEOUT_S = 3.0, 30.0
 #: Silence after which a server counts as disconnected; it publishes its state five times a second.
 _STALE_S = 2.0
 _LINES = 5000
@@ -191,7 +70,7 @@ _EVENT_S = 10.0
 
 
 @renamed_members(check="plan")
-class Connection:
+class Connection(DeviceRequests):
     """A connection to a server, see :func:`connect`; implements :class:`~escape_hw.remote.source.DataSource`.
 
     It controls the server while it holds the lease. When the server has no free place, ``open_loop``,
@@ -599,96 +478,6 @@ class Connection:
         """Load a FITS product into the server, by default under its file's name."""
         answer, _ = self._request("load_product", SLOW_TIMEOUT_S, path=str(path), name=name)
         return ProductEntry.model_validate(answer)
-
-    def check_camera(self, camera: str, **settings: Any) -> CameraPlan:
-        """What other settings of a camera would change; nothing is changed.
-
-        Parameters
-        ----------
-        camera
-            ``"wfs"`` or ``"science"``.
-        settings
-            ``exposure_s``, ``frame_rate_hz``, ``gain_db``, ``region`` (x, y, width, height); those that are
-            absent stay.
-
-        Raises
-        ------
-        SettingRejected
-            A value is outside the range of the camera.
-        """
-        answer, _ = self._request("check_camera", camera=camera, **settings)
-        return CameraPlan.model_validate(answer)
-
-    def set_camera(self, camera: str, **settings: Any) -> CameraPlan:
-        """Change settings of a camera, see :meth:`check_camera`; returns what was changed.
-
-        Raises
-        ------
-        RequestRefused
-            A procedure runs, or the loop is closed, which needs the camera unchanged.
-        SettingRejected
-            A value is outside the range of the camera, which is unchanged.
-        """
-        answer, _ = self._request("set_camera", SLOW_TIMEOUT_S, camera=camera, **settings)
-        return CameraPlan.model_validate(answer)
-
-    def check_poke(self, kind: str, number: int, amplitude: float, seconds: float = 2.0) -> PokePlan:
-        """What :meth:`poke` would do; nothing moves."""
-        answer, _ = self._request(
-            "check_poke", SLOW_TIMEOUT_S, kind=kind, number=number, amplitude=amplitude, seconds=seconds
-        )
-        return PokePlan.model_validate(answer)
-
-    def poke(self, kind: str, number: int, amplitude: float, seconds: float = 2.0) -> None:
-        """Poke one actuator or mode for some seconds; the mirror then returns to flat by itself.
-
-        Parameters
-        ----------
-        kind, number
-            ``"actuator"`` or ``"mode"``, and its number from 0.
-        amplitude
-            Command of the actuator, or of the actuator that the mode moves most, as fraction of full stroke.
-
-        Raises
-        ------
-        RequestRefused
-            The bench is not idle, there is no such actuator or mode, or the poke exceeds a limit.
-        """
-        self._request("poke", SLOW_TIMEOUT_S, kind=kind, number=number, amplitude=amplitude, seconds=seconds)
-
-    def set_offsets(
-        self, terms: Mapping[str, float] | None = None, *, references: str = "keep", flat: str = "keep"
-    ) -> OffsetsState:
-        """Set the offsets of the mirror at rest and of what a closed loop converges to.
-
-        Parameters
-        ----------
-        terms
-            All terms, in nm rms wavefront: ``tip``, ``tilt``, ``focus``, ``mode 12``; ``None``: as they are.
-        references, flat
-            ``"keep"``, ``"clear"`` or ``"present"``: the mean of the present slopes as reference of the loop,
-            and the present shape of the mirror as flat.
-
-        Raises
-        ------
-        RequestRefused
-            A procedure runs, or a limit of the mirror forbids it; nothing changed.
-        """
-        answer, _ = self._request(
-            "set_offsets", SLOW_TIMEOUT_S, terms=None if terms is None else dict(terms),
-            references=references, flat=flat,
-        )  # fmt: skip
-        return OffsetsState.model_validate(answer)
-
-    def save_offsets(self, name: str) -> OffsetsState:
-        """Save the present offsets on the server."""
-        answer, _ = self._request("save_offsets", SLOW_TIMEOUT_S, name=name)
-        return OffsetsState.model_validate(answer)
-
-    def load_offsets(self, name: str) -> OffsetsState:
-        """Restore saved offsets, one of ``state.offsets.saved``."""
-        answer, _ = self._request("load_offsets", SLOW_TIMEOUT_S, name=name)
-        return OffsetsState.model_validate(answer)
 
     def record(self, on: bool, *, images: bool = True, seconds: float | None = None) -> None:
         """Start or stop recording telemetry at full rate.

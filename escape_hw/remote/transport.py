@@ -23,6 +23,8 @@ from escape_hw.supervision import BackgroundThread
 
 log = logging.getLogger(__name__)
 
+#: Longest wait for an ordinary reply, and for one that is sent when the mirror is flat, seconds.
+TIMEOUT_S, SLOW_TIMEOUT_S = 3.0, 30.0
 #: Interval of heartbeats, seconds.
 _HEARTBEAT_S = 0.5
 #: Identifier of heartbeats, whose reply no caller waits for.

@@ -168,8 +168,8 @@ def summary_lines(result: MatrixComparison) -> list[str]:
     ]
 
 
-def mode_table(result: MatrixComparison, count: int = 12) -> Table:
-    """Evenly spaced modes with correlation, gain ratio and relative difference."""
+def mode_table(result: MatrixComparison) -> Table:
+    """A dozen evenly spaced modes with correlation, gain ratio and relative difference."""
     rows = tuple(
         (
             f"{mode + 1}",
@@ -177,7 +177,7 @@ def mode_table(result: MatrixComparison, count: int = 12) -> Table:
             f"{result.gain_ratio[mode]:.4f}",
             f"{100 * result.relative_rms[mode]:.2f} %",
         )
-        for mode in representative_modes(result.correlation.size, count)
+        for mode in representative_modes(result.correlation.size, 12)
     )
     return Table(("Mode", "correlation", "gain B / A", "relative rms difference"), rows)
 

@@ -18,10 +18,10 @@ _LOCK_PRESENT = 1
 _ISOLATED = Path("/sys/devices/system/cpu/isolated")
 
 
-def isolated_cpus(path: Path = _ISOLATED) -> tuple[int, ...]:
+def isolated_cpus() -> tuple[int, ...]:
     """Processors that are isolated from the scheduler (boot option ``isolcpus``)."""
     try:
-        parts = [part.split("-") for part in path.read_text().strip().split(",") if part]
+        parts = [part.split("-") for part in _ISOLATED.read_text().strip().split(",") if part]
         return tuple(cpu for ends in parts for cpu in range(int(ends[0]), int(ends[-1]) + 1))
     except (OSError, ValueError):
         return ()

@@ -59,10 +59,10 @@ class Segment:
     alive: bool
 
 
-def segment_name(system: str, stream: str, pid: int | None = None) -> str:
-    """Name of a stream's segment; by default owned by this process."""
+def segment_name(system: str, stream: str) -> str:
+    """Name of the segment of a stream of this process."""
     system = re.sub(r"[^A-Za-z0-9._-]", "_", system)
-    return f"escape-{os.getuid()}-{system}-{os.getpid() if pid is None else pid}-{stream}"
+    return f"escape-{os.getuid()}-{system}-{os.getpid()}-{stream}"
 
 
 def create(name: str, size: int, fill: struct.Struct, *header: int) -> mmap.mmap:

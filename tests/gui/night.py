@@ -225,10 +225,10 @@ class Night:
         QTest.mouseClick(browser.table.viewport(), Qt.MouseButton.LeftButton, pos=where)
         assert browser.selected is not None
         assert browser.selected.date.startswith(yesterday.isoformat())
-        assert browser.verdict.text() == browser.selected.verdict
+        assert browser.message.text() == browser.selected.verdict
         before = len(self.state.products)
         self.operator.press(browser.load_button)
-        self.operator.until(lambda: browser.verdict.text().startswith("Loaded as"), browser.verdict.text)
+        self.operator.until(lambda: browser.message.text().startswith("Loaded as"), browser.message.text)
         self.images("runs", browser)
         browser.reject()
         assert len(self.state.products) > before

@@ -117,13 +117,13 @@ def test_the_matrix_of_an_earlier_night_becomes_the_setpoint_of_the_loop(
     assert not browser.load_button.isEnabled()
     assert "select a run" in browser.load_button.toolTip()
     click(browser, "escape-7")
-    assert "SNR 12 in the worst mode" in browser.verdict.text()
+    assert "SNR 12 in the worst mode" in browser.message.text()
     QTest.mouseClick(browser.load_button, Qt.MouseButton.LeftButton)
     loop = window.panels["loop"]
     qtbot.waitUntil(lambda: loop.matrix.currentText() == "escape-7")
     folder = runs / "2026-11-21" / "214530_razor-shwfs_calibrate-escape-7"
     assert control.asked == [("load_product", {"path": folder / "im.fits", "name": "escape-7"})]
-    assert "Loaded as 'escape-7'" in browser.verdict.text()
+    assert "Loaded as 'escape-7'" in browser.message.text()
     assert "press Check" in loop.message.text()
     window.update_timer.tick(force=True)
     assert loop.matrix.currentText() == "escape-7"

@@ -49,7 +49,7 @@ def record(folder: Path, n: int = 1024, n_modes: int = 20) -> Path:
 
 @pytest.fixture
 def runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setattr("escape_gui.window.recording_browser.runs_folder", lambda session: tmp_path)
+    monkeypatch.setattr("escape_gui.window.browser.runs_folder", lambda session: tmp_path)
     return tmp_path
 
 

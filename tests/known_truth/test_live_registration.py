@@ -13,7 +13,7 @@ from escape_hw.calibration.acquisition.sensor_setup import build_slope_function,
 from escape_hw.calibration.acquisition.slope_statistics import SlopeStatistics
 from escape_hw.calibration.loop.control import build_integrator
 from escape_hw.calibration.loop.runner import RunningLoop
-from escape_hw.calibration.tracking.live_registration import LiveRegistration
+from escape_hw.calibration.tracking.live_registration import LiveRegistration, count_history_rows
 from escape_hw.errors import TooFewFrames
 from escape_hw.paper.sky_time import GOAL, random_registration, registration_overrides
 from escape_hw.runtime.session.system import System, open_system
@@ -45,7 +45,8 @@ def looked(
         n_curve_coefficients=n_curve_coefficients, response=start.response,
         step_s=frames / bench.wfs.settings.frame_rate_hz,
     )  # fmt: skip
-    buffer = TelemetryBuffer(start.grid.n_slopes, start.matrix.n_modes, frames, live.memory_rows)
+    history = count_history_rows(c.whiten_order, c.lags)
+    buffer = TelemetryBuffer(start.grid.n_slopes, start.matrix.n_modes, frames, history)
     for _ in range(blocks):
         bench.run(
             loop.run(

@@ -7,7 +7,8 @@ import pytest
 
 from escape_hw.api.registration import Registration
 from escape_hw.config import layouts
-from escape_sim.mirror.influence_functions import InfluenceFunctions, layout_positions
+from escape_hw.config.layouts import grid_positions
+from escape_sim.mirror.influence_functions import InfluenceFunctions
 from escape_sim.mirror.surface import make_mirror_surface
 from escape_sim.oopao.library import make_source, mis_registration, oopao_classes, suppress_output
 
@@ -38,7 +39,7 @@ REGISTRATIONS = [
 def influence() -> InfluenceFunctions:
     pitch = PUPIL_M / 9
     y, x = np.indices((11, 11)) - 5
-    return InfluenceFunctions(layout_positions(x**2 + y**2 <= 29, pitch), pitch, COUPLING)
+    return InfluenceFunctions(pitch * grid_positions(x**2 + y**2 <= 29), pitch, COUPLING)
 
 
 @pytest.fixture(scope="module")

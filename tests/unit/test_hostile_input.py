@@ -116,7 +116,7 @@ def test_arrays_that_claim_more_than_there_is(tmp_path: Path, content: bytes) ->
 
 
 def test_a_zip_bomb_is_not_unpacked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("escape_hw.io.arrays.MAX_ARRAY_BYTES", 1_000_000)
+    monkeypatch.setattr("escape_hw.array_files.MAX_ARRAY_BYTES", 1_000_000)
     path = tmp_path / "bomb.npz"
     path.write_bytes(archive(npy("(200000,)", bytes(1_600_000))))
     assert path.stat().st_size < 10_000

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from escape_hw.api.registration import Registration
+from escape_hw.config.layouts import grid_positions
 from escape_sim.mirror.influence_functions import (
     InfluenceFunctions,
     exponential_length,
     exponential_profile,
-    layout_positions,
 )
 from escape_sim.mirror.measured import MeasuredInfluenceFunctions
 from escape_sim.mirror.surface import DenseSurface, GriddedSurface, WindowedSurface, make_mirror_surface
@@ -26,7 +26,7 @@ ANAMORPHIC = Registration(37.0, -61.0, 1.7, 5.3, -3.1, 33.0)
 def mirror(**options):
     layout = np.ones((5, 7), bool)
     layout[0, 0] = layout[4, 6] = False
-    return InfluenceFunctions(layout_positions(layout, PITCH), PITCH, 0.4, **options)
+    return InfluenceFunctions(PITCH * grid_positions(layout), PITCH, 0.4, **options)
 
 
 def dense(m, registration):
@@ -78,7 +78,7 @@ def test_positions_are_row_major_and_centred():
     assert at[0] == pytest.approx([-2 * PITCH, -2 * PITCH])
     assert at[1] == pytest.approx([-1 * PITCH, -2 * PITCH])
     assert at[6] == pytest.approx([-3 * PITCH, -1 * PITCH])
-    assert layout_positions(np.ones((4, 6), bool), 1.0).mean(axis=0) == pytest.approx([0, 0])
+    assert grid_positions(np.ones((4, 6), bool)).mean(axis=0) == pytest.approx([0, 0])
 
 
 def test_coupling_is_the_height_one_pitch_away():
@@ -147,7 +147,7 @@ def test_the_faster_way_is_taken():
     few = make_mirror_surface(mirror(), Registration(), D, X, Y)
     assert isinstance(few, DenseSurface)
     line = np.linspace(-1, 1, 120)
-    many = InfluenceFunctions(layout_positions(np.ones((30, 30), bool), 2 / 30), 2 / 30, 0.3)
+    many = InfluenceFunctions(grid_positions(np.ones((30, 30), bool)) * 2 / 30, 2 / 30, 0.3)
     fast = make_mirror_surface(many, Registration(rotation=3.0), 0.1, line, line)
     assert isinstance(fast, WindowedSurface)
     command = np.random.default_rng(3).uniform(-1, 1, 900)

@@ -9,14 +9,15 @@ import pytest
 from astropy.io import fits
 
 from escape_hw.api.registration import Registration
+from escape_hw.config.layouts import grid_positions
 from escape_hw.errors import ConfigError
-from escape_sim.mirror.influence_functions import InfluenceFunctions, layout_positions
+from escape_sim.mirror.influence_functions import InfluenceFunctions
 from escape_sim.mirror.influence_maps import MapSettings, fill_gaps, filter_noise, read_cube, read_maps
 from escape_sim.mirror.measured import MeasuredInfluenceFunctions
 
 N = 7
 GRID = np.hypot(*(np.indices((N, N)) - N // 2)) < 3.5
-LAYOUT = layout_positions(GRID, 1.0)
+LAYOUT = grid_positions(GRID)
 #: Pixels per pitch, and the coordinates of the pixels in pitches.
 FINE = 8
 X = np.arange(-38, 39) / FINE

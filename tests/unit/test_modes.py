@@ -16,8 +16,9 @@ from escape_hw.calibration.modes.bases import (
     von_karman_covariance,
     zonal,
 )
+from escape_hw.config.layouts import grid_positions
 from escape_hw.errors import CalibrationError
-from escape_sim.mirror.influence_functions import InfluenceFunctions, layout_positions
+from escape_sim.mirror.influence_functions import InfluenceFunctions
 
 DIAMETER = 6.75e-3
 N = 40
@@ -30,7 +31,7 @@ def mirror():
     line = np.arange(9) - 4
     layout = line[:, None] ** 2 + line**2 <= 20
     pitch = DIAMETER / 7
-    influence = InfluenceFunctions(layout_positions(layout, pitch), pitch, 0.4)
+    influence = InfluenceFunctions(pitch * grid_positions(layout), pitch, 0.4)
     x = (np.arange(N) - (N - 1) / 2) * PIXEL
     pupil = np.hypot(x[:, None], x) <= DIAMETER / 2
     return influence.surfaces(Registration(), DIAMETER / 24, x, x), pupil

@@ -75,7 +75,7 @@ class AravisCamera(BlockingCamera[AravisLibrary]):
     name
         Name in messages.
     **settings
-        Fields of :class:`~escape_drivers.common.camera.CameraRequest` (``region``, ``exposure_s``,
+        Fields of :class:`~escape_drivers.common.camera.CameraSetup` (``region``, ``exposure_s``,
         ``frame_rate_hz``, ``gain_db``, ``bit_depth``; the size of the sensor is read from the camera) and of
         :class:`AravisOptions`.
 
@@ -86,10 +86,10 @@ class AravisCamera(BlockingCamera[AravisLibrary]):
     """
 
     def __init__(self, serial: str, *, name: str = "aravis", **settings: Any) -> None:
-        request, options = split_settings(name, serial, settings, AravisOptions)
+        setup, options = split_settings(name, serial, settings, AravisOptions)
         if "bit_depth" not in settings:
-            request = replace(request, bit_depth=int(options.pixel_format.removeprefix("Mono")))
-        super().__init__(name, request, "GenICam camera", _BLOCK_ID_RANGE)
+            setup = replace(setup, bit_depth=int(options.pixel_format.removeprefix("Mono")))
+        super().__init__(name, setup, "GenICam camera", _BLOCK_ID_RANGE)
         self._options = options
         self._incomplete = 0
 
@@ -106,7 +106,7 @@ class AravisCamera(BlockingCamera[AravisLibrary]):
 
     def _open(self) -> None:
         library = self._connection = AravisLibrary(self.name, self._options.library)
-        library.open(self._request.serial, self._options.interface)
+        library.open(self._setup.serial, self._options.interface)
         model = (library.call("camera_get_model_name") or b"GenICam camera").decode(errors="replace")
         library.call("camera_set_pixel_format_from_string", self._options.pixel_format.encode())
         for feature in _AUTO_FEATURES:
@@ -120,8 +120,8 @@ class AravisCamera(BlockingCamera[AravisLibrary]):
         library.call("camera_set_region", 0, 0, width, height)
         self._limits = _read_limits(library)
         self._info = self._build_info(model, library.stand_in or self._options.interface == "Fake")
-        log.info("%s: %s, serial number %s", self.name, model, self._request.serial)
-        self._settings = self._apply_settings(self._check(self._request.settings((width, height))))
+        log.info("%s: %s, serial number %s", self.name, model, self._setup.serial)
+        self._settings = self._apply_settings(self._check(self._setup.settings((width, height))))
 
     def _apply_settings(self, want: CameraSettings) -> CameraSettings:
         library, limits, region = self._require_connected(), self._require_limits(), want.region

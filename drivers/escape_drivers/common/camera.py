@@ -84,7 +84,7 @@ UNKNOWN_SENSOR = (0, 0)
 
 
 @dataclass(frozen=True, slots=True)
-class CameraRequest:
+class CameraSetup:
     """What a camera is to be set to when it opens; defaults for one that is opened without a system file.
 
     Parameters
@@ -125,18 +125,18 @@ class CameraRequest:
 
 def split_settings(
     name: str, serial: str, settings: Mapping[str, Any], options: type[OptionsT]
-) -> tuple[CameraRequest, OptionsT]:
-    """Keywords of a camera's class as its request and the options of its driver.
+) -> tuple[CameraSetup, OptionsT]:
+    """Keywords of a camera's class as its setup and the options of its driver.
 
     Raises
     ------
     ConfigError
         An option is unknown or wrong, or the serial number is missing.
     """
-    keys = {field.name for field in fields(CameraRequest)} - {"serial"}
-    request = CameraRequest(serial, **{key: value for key, value in settings.items() if key in keys})
+    keys = {field.name for field in fields(CameraSetup)} - {"serial"}
+    setup = CameraSetup(serial, **{key: value for key, value in settings.items() if key in keys})
     rest = {key: value for key, value in settings.items() if key not in keys}
-    return request, parse_options(options, name, rest)
+    return setup, parse_options(options, name, rest)
 
 
 class BlockingCamera(Camera, Generic[C]):
@@ -147,7 +147,7 @@ class BlockingCamera(Camera, Generic[C]):
 
     Parameters
     ----------
-    request
+    setup
         What the camera is to be set to when it opens.
     kind
         Name of the camera until it reports its model.
@@ -155,11 +155,11 @@ class BlockingCamera(Camera, Generic[C]):
         First and last number of its frame counter.
     """
 
-    def __init__(self, name: str, request: CameraRequest, kind: str, counter: tuple[int, int]) -> None:
+    def __init__(self, name: str, setup: CameraSetup, kind: str, counter: tuple[int, int]) -> None:
         super().__init__(name)
-        self._request, self._kind = request, kind
-        self._sensor_px = request.sensor_px
-        self._settings = request.settings(self._sensor_px)
+        self._setup, self._kind = setup, kind
+        self._sensor_px = setup.sensor_px
+        self._settings = setup.settings(self._sensor_px)
         self._info = self._build_info(kind, stand_in=False)
         self._full_scale = np.uint16(self._info.full_scale)
         self._saturation_mask = np.empty((0, 0), np.bool_)
@@ -212,13 +212,13 @@ class BlockingCamera(Camera, Generic[C]):
         return self._connection
 
     def _build_info(self, model: str, stand_in: bool) -> CameraInfo:
-        request = self._request
+        setup = self._setup
         named = f"{model} (stand-in)" if stand_in else model
-        return CameraInfo(named, request.serial, self._sensor_px[::-1], request.bit_depth, simulated=stand_in)
+        return CameraInfo(named, setup.serial, self._sensor_px[::-1], setup.bit_depth, simulated=stand_in)
 
     def _adopt_sensor(self, found: tuple[int, int], alternative: str) -> None:
         """Adopt the sensor size (width, height) that the camera reports; refuse one other than requested."""
-        stated = self._request.sensor_px
+        stated = self._setup.sensor_px
         self._sensor_px = found
         if stated != UNKNOWN_SENSOR and found != stated:
             raise DeviceError(

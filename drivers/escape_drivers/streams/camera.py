@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import abc
 import time
 from dataclasses import replace
 from itertools import pairwise
@@ -14,8 +13,9 @@ from numpy.typing import NDArray
 from escape_drivers.common.camera import BlockingCamera, split_settings
 from escape_drivers.common.options import camera_settings, section_options
 from escape_drivers.streams.source import (
-    open_milk,
-    open_pyrtc,
+    MILK,
+    PYRTC,
+    StreamSource,
     open_stream,
     stream_serial,
     with_stream_serial,
@@ -70,7 +70,7 @@ class StreamCamera(BlockingCamera[Stream]):
     name
         Name in messages.
     **settings
-        Fields of :class:`~escape_drivers.common.camera.CameraRequest` and of :class:`StreamCameraOptions`.
+        Fields of :class:`~escape_drivers.common.camera.CameraSetup` and of :class:`StreamCameraOptions`.
 
     Raises
     ------
@@ -78,15 +78,14 @@ class StreamCamera(BlockingCamera[Stream]):
         No stream is named or an option is wrong.
     """
 
-    #: What the stream is called in ``info``.
-    KIND: ClassVar[str]
+    SOURCE: ClassVar[StreamSource]
 
     def __init__(self, stream: str, *, serial: str = "", name: str = "camera", **settings: Any) -> None:
         serial = stream_serial("stream", serial, stream)
-        request, options = split_settings(name, serial, {**settings, "stream": stream}, StreamCameraOptions)
-        super().__init__(name, request, self.KIND, _COUNTER_RANGE)
+        setup, options = split_settings(name, serial, {**settings, "stream": stream}, StreamCameraOptions)
+        super().__init__(name, setup, self.SOURCE.kind, _COUNTER_RANGE)
         self._options = options
-        self._info = self._make_info(self.KIND)
+        self._info = self._make_info(self.SOURCE.kind)
         self._last_count, self._written_ns = 0, 0
 
     @classmethod
@@ -99,21 +98,15 @@ class StreamCamera(BlockingCamera[Stream]):
     def _make_info(self, kind: str) -> CameraInfo:
         return replace(self._build_info(kind, stand_in=False), simulated=self._options.simulated)
 
-    @staticmethod
-    @abc.abstractmethod
-    def _open_named(name: str, write: bool) -> Stream:
-        """Open a stream by its name, for reading or for writing."""
-
     def _open(self) -> None:
-        opener = self._open_named
-        stream = self._connection = open_stream(self.name, opener, self._options.stream, write=False)
+        stream = self._connection = open_stream(self.name, self.SOURCE, self._options.stream, write=False)
         if len(stream.shape) != 2:
             raise DeviceError(
                 self.name, f"stream '{stream.name}' has shape {stream.shape}; a camera's frames have two axes"
             )
         self._adopt_sensor((stream.shape[1], stream.shape[0]), "to the size of the stream")
-        self._info = self._make_info(f"{self.KIND} {stream.name}")
-        now = self._request.settings(self._sensor_px)
+        self._info = self._make_info(f"{self.SOURCE.kind} {stream.name}")
+        now = self._setup.settings(self._sensor_px)
         rate = self._measure_rate(stream) or now.frame_rate_hz
         self._settings = replace(now, frame_rate_hz=rate, exposure_s=min(now.exposure_s, 1 / rate))
 
@@ -181,21 +174,13 @@ class StreamCamera(BlockingCamera[Stream]):
 class PyrtcCamera(StreamCamera):
     """A camera of pyRTC."""
 
-    KIND = "pyRTC stream"
-
-    @staticmethod
-    def _open_named(name: str, write: bool) -> Stream:
-        return open_pyrtc(name, write)
+    SOURCE = PYRTC
 
 
 class MilkCamera(StreamCamera):
     """A camera of milk or CACAO."""
 
-    KIND = "milk image"
-
-    @staticmethod
-    def _open_named(name: str, write: bool) -> Stream:
-        return open_milk(name, write)
+    SOURCE = MILK
 
 
 #: Names of the entry points in version 0.1.0, which an environment installed then still has.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import abc
 import math
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
@@ -12,8 +11,9 @@ from pydantic import Field
 
 from escape_drivers.common.options import layout_of, mirror_settings, parse_options, section_options
 from escape_drivers.streams.source import (
-    open_milk,
-    open_pyrtc,
+    MILK,
+    PYRTC,
+    StreamSource,
     open_stream,
     stream_serial,
     with_stream_serial,
@@ -80,8 +80,7 @@ class StreamMirror(DeformableMirror):
         No stream is named or an option is wrong.
     """
 
-    #: What the stream is called in ``info``.
-    KIND: ClassVar[str]
+    SOURCE: ClassVar[StreamSource]
 
     def __init__(
         self,
@@ -117,18 +116,14 @@ class StreamMirror(DeformableMirror):
         """Identity and geometry; ``NotOpen`` before ``open`` if no layout was given."""
         if not self._layout:
             raise NotOpen(self.name, "its number of actuators is known once it is open; call open() first")
+        model = f"{self.SOURCE.kind} {self._options.stream}"
         return mirror_info(
-            self._layout, self._pitch_m, self._stroke_m, f"{self.KIND} {self._options.stream}", self._serial,
+            self._layout, self._pitch_m, self._stroke_m, model, self._serial,
             simulated=self._options.simulated,
         )  # fmt: skip
 
-    @staticmethod
-    @abc.abstractmethod
-    def _open_named(name: str, write: bool) -> Stream:
-        """Open a stream by its name, for reading or for writing."""
-
     def _open(self) -> None:
-        stream = self._stream = open_stream(self.name, self._open_named, self._options.stream, write=True)
+        stream = self._stream = open_stream(self.name, self.SOURCE, self._options.stream, write=True)
         layout = self._layout = self._layout or layout_of(self.name, math.prod(stream.shape))
         n_act = layouts.n_actuators(layout)
         grid = layouts.layout_map(layout) if layouts.is_on_grid(layout) else None
@@ -169,21 +164,13 @@ class StreamMirror(DeformableMirror):
 class PyrtcMirror(StreamMirror):
     """A mirror of pyRTC."""
 
-    KIND = "pyRTC stream"
-
-    @staticmethod
-    def _open_named(name: str, write: bool) -> Stream:
-        return open_pyrtc(name, write)
+    SOURCE = PYRTC
 
 
 class MilkMirror(StreamMirror):
     """A mirror of milk or CACAO."""
 
-    KIND = "milk image"
-
-    @staticmethod
-    def _open_named(name: str, write: bool) -> Stream:
-        return open_milk(name, write)
+    SOURCE = MILK
 
 
 #: Names of the entry points in version 0.1.0, which an environment installed then still has.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -17,21 +17,20 @@ if TYPE_CHECKING:
 
 S = TypeVar("S", bound="DeviceConfig")
 
-#: Opens a stream by its name, for reading or for writing.
-Opener = Callable[[str, bool], Stream]
+
+class StreamSource(NamedTuple):
+    """Software whose streams replace devices: what a stream is called in ``info``, and how it is opened."""
+
+    kind: str
+    #: Opens a stream by its name, for reading or for writing.
+    open: Callable[[str, bool], Stream]
 
 
-def open_pyrtc(name: str, write: bool) -> Stream:
-    """Open a stream of pyRTC's."""
-    return ShmemStream.open(name, write=write)
+PYRTC = StreamSource("pyRTC stream", lambda name, write: ShmemStream.open(name, write=write))
+MILK = StreamSource("milk image", lambda name, write: MilkStream.open(name))
 
 
-def open_milk(name: str, write: bool) -> Stream:
-    """Open an image of milk's."""
-    return MilkStream.open(name)
-
-
-def open_stream(device: str, opener: Opener, name: str, *, write: bool) -> Stream:
+def open_stream(device: str, source: StreamSource, name: str, *, write: bool) -> Stream:
     """Open a stream for a device.
 
     Raises
@@ -40,7 +39,7 @@ def open_stream(device: str, opener: Opener, name: str, *, write: bool) -> Strea
         The stream cannot be opened or does not contain numbers.
     """
     try:
-        stream = opener(name, write)
+        stream = source.open(name, write)
     except EscapeError as error:
         raise DeviceError(device, str(error)) from error
     if np.dtype(stream.dtype).kind not in "iuf":

@@ -119,7 +119,7 @@ class XimeaCamera(BlockingCamera[XimeaLibrary]):
     name
         Name in messages.
     **settings
-        Fields of :class:`~escape_drivers.common.camera.CameraRequest` (``region``, ``exposure_s``,
+        Fields of :class:`~escape_drivers.common.camera.CameraSetup` (``region``, ``exposure_s``,
         ``frame_rate_hz``, ``gain_db``, ``bit_depth``; the size of the sensor is read from the camera) and of
         :class:`XimeaOptions`.
 
@@ -130,8 +130,8 @@ class XimeaCamera(BlockingCamera[XimeaLibrary]):
     """
 
     def __init__(self, serial: str, *, name: str = "ximea", **settings: Any) -> None:
-        request, options = split_settings(name, serial, settings, XimeaOptions)
-        super().__init__(name, request, "XIMEA camera", (0, _NO_FRAME_NUMBER))
+        setup, options = split_settings(name, serial, settings, XimeaOptions)
+        super().__init__(name, setup, "XIMEA camera", (0, _NO_FRAME_NUMBER))
         self._options = options
         self._image = XiImage(size=ctypes.sizeof(XiImage))
         self._address = ctypes.c_void_p(ctypes.addressof(self._image))
@@ -160,8 +160,8 @@ class XimeaCamera(BlockingCamera[XimeaLibrary]):
 
     def _open(self) -> None:
         library = self._connection = XimeaLibrary(self.name, self._options.library)
-        library.open(self._request.serial)
-        for name, value in self._options.sdk_parameters(self._request.bit_depth):
+        library.open(self._setup.serial)
+        for name, value in self._options.sdk_parameters(self._setup.bit_depth):
             library.set(name, value)
         _reset_offset(library)
         limits = self._limits = _read_limits(library)
@@ -173,7 +173,7 @@ class XimeaCamera(BlockingCamera[XimeaLibrary]):
         log.info("%s: %s %s, xiAPI %s", self.name, model, serial, version)
         self._info = self._build_info(f"XIMEA {model}", library.stand_in)
         self._get_image = library.c.xiGetImage
-        self._settings = self._apply_settings(self._check(self._request.settings(sensor)))
+        self._settings = self._apply_settings(self._check(self._setup.settings(sensor)))
 
     def _disconnect(self) -> None:
         self._get_image = _raise_not_connected

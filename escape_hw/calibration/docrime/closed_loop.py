@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 
@@ -33,14 +32,16 @@ from escape_hw.calibration.docrime.open_loop import (
     build_solution_matrix,
     collect_solution_notes,
     require_enough_frames,
+    solve_run,
 )
 from escape_hw.calibration.docrime.regression import MAX_CORRELATED_SLOPES
 from escape_hw.calibration.loop.control import build_integrator
 from escape_hw.calibration.loop.divergence import require_not_diverged
 from escape_hw.calibration.loop.performance import collect_loop_notes, select_settled_residual
 from escape_hw.calibration.loop.runner import LoopRecord, RunningLoop
-from escape_hw.errors import Aborted, ConfigError, TooFewFrames
+from escape_hw.errors import Aborted, ConfigError
 from escape_hw.io.fits.run_state import RunState
+from escape_hw.pipeline.statistics import root_mean_square
 
 #: Frames between two checks of the stopping criterion.
 _CHECK_INTERVAL = 500
@@ -169,18 +170,13 @@ def docrime_closed_run(
         acquisition.restore(state)
     stage = f"{pattern.title} in closed loop"
     partial = yield from acquisition.poke(n_frames, pattern(amplitude, bench.rng), stage)
-    try:
-        solution = estimator.solve()
-    except TooFewFrames:
-        if partial:
-            raise Aborted(f"aborted after {estimator.frames_received} frames, too few for a matrix") from None
-        raise
+    solution = solve_run(estimator, partial, estimator.frames_received)
     record, skipped = acquisition.loop.record, acquisition.estimator_thread.skipped
     residual = select_settled_residual(record, bench.wfs.settings.frame_rate_hz)
     matrix = build_solution_matrix(
         bench, grid, m2c, solution, method, poke=float(poke), clipped_pokes=record.shortened,
         skipped=skipped, loop_gain=bench.config.loop.gain,
-        loop_residual_nm=float(np.sqrt(np.mean(np.square(residual)))) if residual.size else math.nan,
+        loop_residual_nm=root_mean_square(residual),
     )  # fmt: skip
     seconds = (solution.frames + solution.lost_frames) / bench.wfs.settings.frame_rate_hz
     notes = [

@@ -96,17 +96,22 @@ def docrime_run(
     sensor = acquisition.sensor
     if sensor.estimator is None:
         raise RuntimeError("the acquisition has no estimator")
-    try:
-        solution = sensor.estimator.solve()
-    except TooFewFrames:
-        if partial:
-            raise Aborted(f"aborted after {acquisition.n_received} frames, too few for a matrix") from None
-        raise
+    solution = solve_run(sensor.estimator, partial, acquisition.n_received)
     method = pattern.method + ("-whitened" if whiten and issubclass(pattern, RandomPokes) else "")
     matrix = build_solution_matrix(
         bench, sensor.grid, m2c, solution, method, poke=float(poke), clipped_pokes=acquisition.shortened
     )
     return DocrimeRun(_result(acquisition, matrix, solution, partial), solution, acquisition.record())
+
+
+def solve_run(estimator: DocrimeEstimator, aborted: bool, n_frames: int) -> DocrimeSolution:
+    """Solve the sums of a run of ``n_frames``; :class:`Aborted` if it was aborted too early."""
+    try:
+        return estimator.solve()
+    except TooFewFrames:
+        if aborted:
+            raise Aborted(f"aborted after {n_frames} frames, too few for a matrix") from None
+        raise
 
 
 def build_solution_matrix(

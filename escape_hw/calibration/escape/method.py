@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.procedure import Procedure, Reporter
@@ -15,6 +16,7 @@ from escape_hw.calibration.acquisition.checkpoint import Checkpoint
 from escape_hw.calibration.acquisition.stopping import Target
 from escape_hw.calibration.docrime.closed_loop import docrime_closed_run
 from escape_hw.calibration.docrime.fit import DocrimeSolution
+from escape_hw.calibration.docrime.monitor import StoppingCriterion
 from escape_hw.calibration.docrime.open_loop import (
     DocrimeRun,
     build_solution_matrix,
@@ -107,29 +109,38 @@ def escape(
             short = yield from calibrate_short_run_closed_loop(bench, closed_loop, frames=n_frames, poke=poke)
         return _note_accuracy(short, until)
     m2c = build_modal_basis(bench) if closed_loop is None else closed_loop.matrix.m2c
+    criterion = _build_criterion(bench, m2c, until, from_matrix)
+    if closed_loop is not None:
+        if not whiten:
+            raise ConfigError("the plain estimator is for open loop; in closed loop turbulence is whitened")
+        run = yield from docrime_closed_run(
+            bench, closed_loop, frames=frames, poke=poke, checkpoint=checkpoint, criterion=criterion
+        )
+    else:
+        run = yield from docrime_run(
+            bench, frames=frames, poke=poke, grid=grid, whiten=whiten, checkpoint=checkpoint,
+            criterion=criterion, record=not from_matrix and n_frames < _FRAMES_PER_MODE * n_modes,
+        )  # fmt: skip
+    return (yield from _synthesise_from_run(bench, run, from_matrix))
+
+
+def _build_criterion(
+    bench: Bench, m2c: NDArray[np.float64], until: Target | None, from_matrix: bool
+) -> StoppingCriterion | None:
+    """Build the stopping criterion of a target; ``None`` without a target."""
+    if until is None:
+        return None
 
     def criterion(solution: DocrimeSolution, grid: SensorGeometry) -> Procedure[bool]:
         matrix = build_solution_matrix(bench, grid, m2c, solution, "escape")
-        if until is None or not until.is_snr_reached(matrix):
+        if not until.is_snr_reached(matrix):
             return False
         if until.accuracy is None:
             return True
         estimate = yield from _fit_solution(bench, matrix, grid, solution, from_matrix)
         return estimate.converged and float(estimate.sigma[:2].max()) <= until.accuracy
 
-    stop_condition = None if until is None else criterion
-    if closed_loop is not None:
-        if not whiten:
-            raise ConfigError("the plain estimator is for open loop; in closed loop turbulence is whitened")
-        run = yield from docrime_closed_run(
-            bench, closed_loop, frames=frames, poke=poke, checkpoint=checkpoint, criterion=stop_condition
-        )
-    else:
-        run = yield from docrime_run(
-            bench, frames=frames, poke=poke, grid=grid, whiten=whiten, checkpoint=checkpoint,
-            criterion=stop_condition, record=not from_matrix and n_frames < _FRAMES_PER_MODE * n_modes,
-        )  # fmt: skip
-    return (yield from _synthesise_from_run(bench, run, from_matrix))
+    return criterion
 
 
 def is_short_run(

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from escape_hw.config.system import ServerSection
 from escape_hw.errors import CalibrationError
+from escape_hw.pipeline.statistics import root_mean_square
 
 #: Frames of the running means of the squared residual: the present one and the usual one.
 _PRESENT_FRAMES, _USUAL_FRAMES = 50, 2000
@@ -105,7 +106,7 @@ class BlockResidualMonitor:
         ``residual``: residual of each frame of the block, in nm; ``n_shortened``: number of commands in the
         block that the limits shortened.
         """
-        rms = float(np.sqrt(np.mean(np.square(residual))))
+        rms = root_mean_square(residual)
         usual = float(np.median(self._residual)) if len(self._residual) >= _MIN_USUAL_BLOCKS else np.inf
         is_limited = n_shortened > _LIMITED_FRACTION * len(residual)
         factor = _LIMITED_FACTOR if is_limited else self._factor

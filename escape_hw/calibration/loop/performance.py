@@ -22,7 +22,7 @@ from escape_hw.calibration.loop.runner import SETTLING_S, LoopRecord, RunningLoo
 from escape_hw.errors import Aborted, CalibrationError
 from escape_hw.pipeline.psf.frame_stack import FrameStack
 from escape_hw.pipeline.psf.strehl import strehl, subtract_background
-from escape_hw.pipeline.statistics import MIN_SAMPLES
+from escape_hw.pipeline.statistics import MIN_SAMPLES, root_mean_square
 
 log = logging.getLogger(__name__)
 
@@ -87,7 +87,7 @@ def close_loop(
         dropped_modes=c.dropped_modes if dropped_modes is None else dropped_modes, frames=record.frames,
         lost_frames=loop.lost_frames, rate_hz=record.frames / seconds,
         stable=not record.diverged and is_steady(residual),
-        residual_rms_nm=float(np.sqrt(np.mean(np.square(settled)))) if settled.size else math.nan,
+        residual_rms_nm=root_mean_square(settled),
         strehl=ratio, latency_us=latency_percentiles(record.latency),
         psf=subtract_background(images.mean(axis=0)).astype(np.float32) if len(images) else None,
         model_psf=model_psf, residual_nm=residual[:: max(1, residual.size // 2000)],

@@ -32,7 +32,7 @@ from escape_hw.calibration.optical_gain.smoothing import clip_gains, smooth_over
 from escape_hw.deprecation import renamed_keywords
 from escape_hw.errors import Aborted, CalibrationError, ConfigError
 from escape_hw.pipeline.psf.strehl import strehl
-from escape_hw.pipeline.statistics import MIN_SAMPLES
+from escape_hw.pipeline.statistics import MIN_SAMPLES, root_mean_square
 
 #: Poke of the first closure and the first round, and its factor from round to round.
 _FIRST_POKE, _POKE_FACTOR = 0.004, 0.5
@@ -246,8 +246,9 @@ class _Bootstrap:
         if self._model_psf is not None and images.count >= MIN_SAMPLES:
             ratios = strehl(images.images(), self._model_psf)
         one = GainRound(
-            gains, float(amplitude.max()), segment.frames, rms(gains.best / clip_gains(previous) - 1),
-            rms(expected), segment.residual_nm, strehl_loss(amplitude, *self._strehl_cost()),
+            gains, float(amplitude.max()), segment.frames,
+            root_mean_square(gains.best / clip_gains(previous) - 1), root_mean_square(expected),
+            segment.residual_nm, strehl_loss(amplitude, *self._strehl_cost()),
             _relative_error(gains) <= accuracy, ratios,
         )  # fmt: skip
         self._rounds.append(one)
@@ -284,7 +285,7 @@ class _Bootstrap:
         if self._applied is None or measured is None:
             return
         gains = _smooth(measured)
-        change = rms(gains.best / clip_gains(self._applied) - 1)
+        change = root_mean_square(gains.best / clip_gains(self._applied) - 1)
         self._rounds.append(
             GainRound(
                 gains, self._largest_amplitude, measured.frames, change, math.nan, math.nan, math.nan, False
@@ -328,9 +329,4 @@ def _is_accurate(measured: OpticalGainEstimate, target: float) -> bool:
 
 def _relative_error(gains: OpticalGains) -> float:
     """Relative standard error, rms over the modes."""
-    return math.hypot(rms(gains.best_sigma / gains.best), gains.common_sigma)
-
-
-def rms(values: NDArray[np.float64]) -> float:
-    """Root mean square."""
-    return float(np.sqrt(np.mean(np.square(values))))
+    return math.hypot(root_mean_square(gains.best_sigma / gains.best), gains.common_sigma)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -23,6 +22,7 @@ from escape_hw.calibration.loop.runner import LoopRecord, RunningLoop
 from escape_hw.calibration.optical_gain.matrix_comparison import projector, scale_matrix, slope_weights
 from escape_hw.errors import CalibrationError, IncompatibleProduct, TooFewFrames
 from escape_hw.pipeline.control.integrator import LeakyIntegrator
+from escape_hw.pipeline.statistics import root_mean_square
 
 #: Frames per mode from which the noise of the projected slopes is estimated.
 _NOISE_FRAMES_PER_MODE = 3
@@ -282,7 +282,7 @@ class GainMeasurementLoop:
         if gains is not None and not loop.record.diverged:
             self._known_response = gains.response
         residual = np.array(loop.record.residual[n_settling:])
-        rms = float(np.sqrt(np.mean(np.square(residual)))) if residual.size else math.nan
+        rms = root_mean_square(residual)
         return LoopSegment(gains, rms, done, loop.record.diverged, loop.record, reason)
 
     def solve_latest(self) -> OpticalGainEstimate | None:

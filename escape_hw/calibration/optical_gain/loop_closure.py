@@ -76,23 +76,9 @@ def bootstrap_loop(
     open_segment, mean_gain, _ = yield from _measure_at_gain(
         loop, amplitude, frames, "open loop", _OPEN_LOOP_GAIN, steps
     )
-    if open_segment.diverged:
-        raise CalibrationError("the pokes alone hold the mirror at its limits; use smaller pokes")
-    if mean_gain is None:
-        raise CalibrationError(
-            "the loop cannot be closed: with this matrix the pokes have no measurable response "
-            f"({open_segment.reason or 'noise'}). Measure the matrix again with more frames, or use larger "
-            "pokes"
-        )
-    if mean_gain[0] < 0:
-        raise CalibrationError(
-            f"the loop cannot be closed: the response to the pokes is {mean_gain[0]:.2g} times that of the "
-            "matrix; a sign is wrong (of the matrix, or of the mirror), or the pupil is flipped"
-        )
-    if open_segment.gains is not None:
-        _require_consistent_signs(open_segment.gains)
-    search = _GainSearch(target_gain, open_segment.residual_nm / mean_gain[0])
-    gain = _FIRST_GAIN_FRACTION * target_gain / mean_gain[0]
+    optical_gain = _require_response(open_segment, mean_gain)
+    search = _GainSearch(target_gain, open_segment.residual_nm / optical_gain)
+    gain = _FIRST_GAIN_FRACTION * target_gain / optical_gain
     for _ in range(_MAX_TRIALS):
         loop.control.set_gain(gain)
         segment, mean_gain, residual = yield from _measure_at_gain(
@@ -105,6 +91,25 @@ def bootstrap_loop(
             loop.open_loop()
         gain = search.next_gain(gain)
     return search.best_closure(loop, steps)
+
+
+def _require_response(segment: LoopSegment, mean_gain: tuple[float, float] | None) -> float:
+    """Mean optical gain in open loop; raises :class:`CalibrationError` for a response unlike the matrix."""
+    if segment.diverged:
+        raise CalibrationError("the pokes alone hold the mirror at its limits; use smaller pokes")
+    if mean_gain is None:
+        raise CalibrationError(
+            "the loop cannot be closed: with this matrix the pokes have no measurable response "
+            f"({segment.reason or 'noise'}). Measure the matrix again with more frames, or use larger pokes"
+        )
+    if mean_gain[0] < 0:
+        raise CalibrationError(
+            f"the loop cannot be closed: the response to the pokes is {mean_gain[0]:.2g} times that of the "
+            "matrix; a sign is wrong (of the matrix, or of the mirror), or the pupil is flipped"
+        )
+    if segment.gains is not None:
+        _require_consistent_signs(segment.gains)
+    return mean_gain[0]
 
 
 def _require_consistent_signs(gains: OpticalGainEstimate) -> None:

@@ -22,6 +22,7 @@ from escape_hw.calibration.sprint.extra_parameters import ExtraParameterModel, F
 from escape_hw.calibration.sprint.influence_shape import InfluenceShape
 from escape_hw.calibration.sprint.normal_equations import NormalEquations, Priors, normal_equations
 from escape_hw.calibration.sprint.weighted_matrix import WeightedMatrix
+from escape_hw.pipeline.statistics import root_mean_square
 
 #: Indices of the common parameters among the unknowns; those of the registration are 1 to 5.
 GAIN, WIDTH, SHAPE = 0, 6, 7
@@ -309,8 +310,7 @@ class MixedEffectsProblem:
             for name in (*groups, "slope_gain")
         }
         # A misfit of the model enlarges the noise that the effects are compared with.
-        rms = float(np.sqrt(np.mean(np.square(system.residual))))
-        noise = max(rms, self.weighted.noise_level(system.residual))
+        noise = max(root_mean_square(system.residual), self.weighted.noise_level(system.residual))
         present = np.array([getattr(self.priors, name) for name in groups])
         ratios = estimate_scatters(
             system.schur_complement, self.offset(state)[:inner], self.precision[:inner],

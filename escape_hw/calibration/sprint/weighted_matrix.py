@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.synthetic_model import HasSlopeWeights, SyntheticModel
+from escape_hw.pipeline.statistics import root_mean_square
 
 #: Residual of a sub-aperture, relative to the median one, up to which its weight is 1.
 _HUBER_THRESHOLD = 1.5
@@ -89,7 +90,7 @@ class WeightedMatrix:
 
     def noise_level(self, residual: NDArray[np.float64]) -> float:
         """Noise of an element in units of the data: 1, or the rms residual without standard errors."""
-        return 1.0 if self.has_standard_errors else float(np.sqrt(np.mean(np.square(residual))))
+        return 1.0 if self.has_standard_errors else root_mean_square(residual)
 
     def explained_fraction(self, residual: NDArray[np.float64]) -> float:
         """Fraction of the sum of squares that a model with this residual explains."""

@@ -68,8 +68,6 @@ class LiveEstimate:
     gains, gains_sigma
         Gain of every mode ``(n_modes,)``, with the standard error of a change: :attr:`matrix` projected on
         the synthetic model, so it includes the effects of slopes, and of actuators beyond the corrections.
-    drift_rate
-        Drift per second ``(6,)``: gain, then the registration.
     innovation
         Largest difference between the data of this update and their prediction, in standard errors.
     misfit
@@ -87,13 +85,17 @@ class LiveEstimate:
     change_covariance: NDArray[np.float64]
     gains: NDArray[np.float64]
     gains_sigma: NDArray[np.float64]
-    drift_rate: NDArray[np.float64]
     innovation: float
     misfit: float
     noise: float
     actuator_gains: NDArray[np.float64]
     matrix: NDArray[np.float64]
     response: TemporalResponse
+
+
+def count_history_rows(order: int, lags: int) -> int:
+    """Rows of history that filters of this length need before the first new row of a block."""
+    return 2 * order + lags
 
 
 class LiveRegistration:
@@ -161,16 +163,11 @@ class LiveRegistration:
         self._updates = 0
         self._drift_line.restart()
 
-    @property
-    def memory_rows(self) -> int:
-        """Rows of history that the filters need before the first new row of a block."""
-        return 2 * self._order + self._lags
-
     def update(self, data: AlignedTelemetry, start: int = 0) -> LiveEstimate:
         """Estimate the registration with one more block of frames.
 
         ``data``: closed-loop telemetry: slopes, total modal commands, and the pokes in them; ``start``: first
-        new row, after :attr:`memory_rows` rows of history.
+        new row, after :func:`count_history_rows` rows of history.
 
         Raises
         ------
@@ -293,9 +290,9 @@ class LiveRegistration:
         gains = np.asarray((self._current_matrix * unit).sum(axis=0) / np.square(unit).sum(axis=0))
         return LiveEstimate(
             estimate, present.random_covariance[1:6, 1:6], gains, self._gains_sigma(present, timing_sigma),
-            present.rate[:6], float(np.abs(present.innovation).max()),
-            float(np.mean(np.square(residual))), float(np.sqrt(block_sums.variance.mean())),
-            state.actuator_gain.copy(), self._current_matrix, response,
+            float(np.abs(present.innovation).max()), float(np.mean(np.square(residual))),
+            float(np.sqrt(block_sums.variance.mean())), state.actuator_gain.copy(), self._current_matrix,
+            response,
         )  # fmt: skip
 
     def _extrapolate_to_now(

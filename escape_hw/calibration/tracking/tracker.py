@@ -33,10 +33,14 @@ from escape_hw.calibration.tracking.exchange import (
     ExchangeProposal,
     propose_exchange,
 )
-from escape_hw.calibration.tracking.live_registration import LiveEstimate, LiveRegistration
+from escape_hw.calibration.tracking.live_registration import (
+    LiveEstimate,
+    LiveRegistration,
+    count_history_rows,
+)
 from escape_hw.errors import Aborted, CalibrationError, ConfigError, TooFewFrames
 from escape_hw.pipeline.psf.frame_stack import FrameStack
-from escape_hw.pipeline.statistics import MIN_SAMPLES
+from escape_hw.pipeline.statistics import MIN_SAMPLES, root_mean_square
 
 #: Seconds between two updates of the registration.
 STEP_S = 1.0
@@ -156,7 +160,8 @@ class _Tracker:
         self.alarm_monitor = AlarmMonitor(start.registration, t.max_shift, response)
         self.result = TrackResult(poke=poke)
         self.frames = max(1, round(STEP_S * bench.wfs.settings.frame_rate_hz))
-        self.buffer = TelemetryBuffer(grid.n_slopes, matrix.n_modes, self.frames, 2 * c.whiten_order + c.lags)
+        history = count_history_rows(c.whiten_order, c.lags)
+        self.buffer = TelemetryBuffer(grid.n_slopes, matrix.n_modes, self.frames, history)
         self.updates, self.residual_at = 0, 0
         self.pending_update: Future[TrackerUpdate | None] | None = None
         self.metrics: dict[str, float] = {}
@@ -336,7 +341,7 @@ def build_row(
         "optical_gain": float(gains.mean()), "optical_gain_sigma": float(gains_sigma.mean()),
         "misfit": live.misfit, "innovation": live.innovation, "noise": live.noise,
         "mismatch": update.proposal.evidence.mismatch,
-        "residual_nm": float(np.sqrt(np.mean(np.square(residual)))) if residual.size else math.nan,
+        "residual_nm": root_mean_square(residual),
         "strehl": update.strehl.value, "strehl_sigma": update.strehl.sigma, "exchanged": float(exchanged),
     }  # fmt: skip
 

@@ -142,30 +142,26 @@ def reproduce_all(
 
     parts: dict[str, Any] = {}
     sweep_folders = find_sweeps(sweeps or [])
-    done = {
-        case.kind: load_finished(
-            out / case.kind, case.kind, request_fields(case.scaled_frames(share), set, seed)
-        )
-        if resume
-        else None
-        for case in select_cases(only)
-    }
-    remaining = [case for case in select_cases(only) if done[case.kind] is None]
+    cases, finished = select_cases(only), dict[str, Any]()
+    for case in cases if resume else ():
+        fields = request_fields(case.scaled_frames(share), set, seed)
+        finished[case.kind] = load_finished(out / case.kind, case.kind, fields)
+    remaining = [case for case in cases if finished.get(case.kind) is None]
     check_share(
         [(case, load_system(case.system, overrides=set or [], seed=seed)) for case in remaining], share
     )
     try:
-        for case in select_cases(only):
+        for case in cases:
             context.notify(f"{case.kind}: {case.title}")
-            saved_part = done[case.kind]
-            if saved_part is None:
+            part = finished.get(case.kind)
+            if part is None:
                 selection = SystemSelection(case.system, tuple(set or ()), seed)
                 counts = case.scaled_frames(share)
-                _, saved_part = _run_case(context, case.kind, counts, selection, out / case.kind)
+                _, part = _run_case(context, case.kind, counts, selection, out / case.kind)
             else:
-                context.notify(f"{case.kind}: finished {saved_part['finished_utc']}, not run again")
-            parts[case.kind] = saved_part
-            context.show(*format_criteria(parts[case.kind]["criteria"]))
+                context.notify(f"{case.kind}: finished {part['finished_utc']}, not run again")
+            parts[case.kind] = part
+            context.show(*format_criteria(part["criteria"]))
     finally:
         if parts:
             context.show(f"index: {write_index(out, parts)}")

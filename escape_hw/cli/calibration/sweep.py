@@ -140,22 +140,36 @@ def sweep(
         if _show_finished(context, resume, resumed):
             return
     with context.run_folder(config, "sweep", out) as folder:
-        from escape_hw.runtime.session.record import BenchRecord
-        from escape_hw.runtime.sweep.result import sweep_and_analyse
-        from escape_hw.runtime.sweep.workers import open_workers
+        _run(context, selection, resumed or request, folder, workers, scheduler)
 
-        with context.bench(selection) as bench:
-            record = BenchRecord.from_bench(bench)
-            description = resumed or _describe(context, request, bench, folder, record)
-            if not bench.simulated:
-                result, stop = context.run_keeping_partial(sweep_and_analyse(description, bench))
-        if description.sweep.simulated:
-            pool = open_workers(workers, scheduler)
-            result, stop = context.run_keeping_partial(sweep_and_analyse(description, pool))
-        with context.protect_saving(stop):
-            _save(context, folder, record, description, result)
-        if stop is not None:
-            raise stop
+
+def _run(
+    context: CommandContext,
+    selection: options.SystemSelection,
+    sweep: SweepDescription | _Request,
+    folder: RunFolder,
+    workers: int,
+    scheduler: str | None,
+) -> None:
+    """Run a new sweep or what is left of one, and save its result in the folder."""
+    from escape_hw.runtime.session.record import BenchRecord
+    from escape_hw.runtime.sweep.result import sweep_and_analyse
+    from escape_hw.runtime.sweep.workers import open_workers
+
+    with context.bench(selection) as bench:
+        record = BenchRecord.from_bench(bench)
+        description = (
+            _describe(context, sweep, bench, folder, record) if isinstance(sweep, _Request) else sweep
+        )
+        if not bench.simulated:
+            result, stop = context.run_keeping_partial(sweep_and_analyse(description, bench))
+    if description.sweep.simulated:
+        pool = open_workers(workers, scheduler)
+        result, stop = context.run_keeping_partial(sweep_and_analyse(description, pool))
+    with context.protect_saving(stop):
+        _save(context, folder, record, description, result)
+    if stop is not None:
+        raise stop
 
 
 def _show_finished(context: CommandContext, run: Path, description: SweepDescription) -> bool:

@@ -6,8 +6,6 @@ The description is a TOML file of four tables, the fields of :class:`MatrixTable
 
 from __future__ import annotations
 
-import gzip
-import io
 import os
 import tomllib
 from dataclasses import dataclass
@@ -22,9 +20,9 @@ from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.pyramid import PyramidPupils
 from escape_hw.api.results import CalibrationResult
 from escape_hw.api.sensor import SensorGeometry, SubApertureGrid
-from escape_hw.bounded_files import MAX_ARRAY_BYTES, MAX_TEXT_BYTES, read_bounded
-from escape_hw.errors import ConfigError, IncompatibleProduct, ProductError
-from escape_hw.io.arrays import decode_arrays
+from escape_hw.array_files import read_array
+from escape_hw.bounded_files import MAX_TEXT_BYTES, read_bounded
+from escape_hw.errors import ConfigError, IncompatibleProduct
 
 #: Response of a pixel, relative to the largest, below which ``valid = "nonzero"`` counts it as zero.
 _ZERO = 1e-12
@@ -240,58 +238,6 @@ def import_arrays(
         target.system, table.method, simulated, slope_unit=grid.slope_unit,
     )  # fmt: skip
     return CalibrationResult(matrix, grid, 0, 0, 0.0, notes=tuple(notes))
-
-
-def read_array(path: Path, name: str = "") -> NDArray[Any]:
-    """An array of a text, NumPy or FITS file, which may be compressed by gzip.
-
-    Parameters
-    ----------
-    name
-        Of the array in an archive, or of the FITS extension; empty: the first.
-
-    Raises
-    ------
-    ProductError
-        Not there, damaged, or without such an array.
-    """
-    try:
-        content = read_bounded(path, MAX_ARRAY_BYTES)
-        if content.startswith(b"\x1f\x8b"):
-            content = _unpack(content)
-        return _decode(content, name)
-    except Exception as error:
-        # NumPy, astropy and zlib raise errors of many kinds for damaged files.
-        reason = error.strerror if isinstance(error, OSError) and error.strerror else error
-        raise ProductError(f"{path}: cannot be read ({reason})") from error
-
-
-def _unpack(content: bytes) -> bytes:
-    with gzip.open(io.BytesIO(content)) as packed:
-        unpacked = packed.read(MAX_ARRAY_BYTES + 1)
-    if len(unpacked) > MAX_ARRAY_BYTES:
-        raise ValueError(f"larger than {MAX_ARRAY_BYTES / 1e6:.0f} MB when unpacked")
-    return unpacked
-
-
-def _decode(content: bytes, name: str) -> NDArray[Any]:
-    if content.startswith(b"SIMPLE"):
-        from astropy.io import fits
-
-        with fits.open(io.BytesIO(content), memmap=False) as hdus:
-            images = [hdu for hdu in hdus if hdu.is_image and hdu.data is not None]
-            chosen = [hdu for hdu in images if not name or hdu.name == name.upper()]
-            if not chosen:
-                raise ValueError(f"has no image {name!r}, only {[hdu.name for hdu in images]}")
-            return np.array(chosen[0].data)
-    if not content.startswith((b"PK", b"\x93NUMPY")):
-        return np.atleast_2d(np.loadtxt(io.StringIO(content.decode("utf-8").replace(",", " "))))
-    loaded = decode_arrays(content)
-    if isinstance(loaded, np.ndarray):
-        return loaded
-    if name and name not in loaded:
-        raise ValueError(f"has no array {name!r}, only {', '.join(loaded)}")
-    return loaded[name] if name else next(iter(loaded.values()))
 
 
 def _slopes_of_commands(

@@ -6,6 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
+from escape_hw.pipeline.statistics import root_mean_square
+
 #: Softness of a rim in pixels (rms): the width of a pixel and diffraction.
 RIM_SOFTNESS = 0.45
 #: Half width in pixels of the ring in which a rim is fitted, and harmonics of its brightness.
@@ -107,7 +109,7 @@ def estimate_roundness_error(
         _rim_step(image, centres, k, radius, width, nominal + _NEIGHBOUR_MARGIN, MAX_HARMONIC)
         for k in range(4)
     ]
-    return float(np.sqrt(np.mean(np.square(np.mean(steps, axis=0)[3:]))))
+    return root_mean_square(np.mean(steps, axis=0)[3:])
 
 
 def _least_squares(terms: NDArray[np.float64], light: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage, special
+from scipy import ndimage
 
 from escape_hw.errors import CalibrationError
 from escape_hw.pipeline.psf.strehl import find_peak, has_light, subtract_background
@@ -145,9 +145,3 @@ def _radius_of_share(radii: NDArray[np.float64], shares: NDArray[np.float64], sh
         return math.nan
     low, high = (0.0, shares[0]) if beyond == 0 else (shares[beyond - 1], shares[beyond])
     return float(radii[beyond] - (radii[1] - radii[0]) * (high - share) / (high - low)) if high > low else 0.0
-
-
-def airy_encircled_energy(radius: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Share of the light of an Airy pattern within a radius in lambda/D (Born & Wolf, section 8.5.2)."""
-    u = np.pi * np.asarray(radius, np.float64)
-    return np.asarray(1 - special.j0(u) ** 2 - special.j1(u) ** 2, np.float64)

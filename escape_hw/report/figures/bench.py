@@ -180,9 +180,7 @@ def _crop_around_peak(image: NDArray[np.float64]) -> NDArray[np.float64]:
     return image[row - half : row + half + 1, column - half : column + half + 1]
 
 
-def mirror_on_grid(
-    command: NDArray[np.float64], layout: NDArray[np.bool_], title: str = "mirror command"
-) -> Figure:
+def mirror_on_grid(command: NDArray[np.float64], layout: NDArray[np.bool_]) -> Figure:
     """A mirror command on the map of its actuators, in percent of full stroke.
 
     Parameters
@@ -192,14 +190,12 @@ def mirror_on_grid(
     """
     values = np.full(layout.shape, np.nan)
     values[layout] = 100 * np.asarray(command, float)
-    figure, axes, limit = _mirror_axes(values, title)
+    figure, axes, limit = _mirror_axes(values)
     axes.imshow(style.map_colours(values, style.DIVERGING, -limit, limit, ~layout), interpolation="nearest")
     return figure
 
 
-def mirror_without_grid(
-    command: NDArray[np.float64], places_m: NDArray[np.float64], title: str = "mirror command"
-) -> Figure:
+def mirror_without_grid(command: NDArray[np.float64], places_m: NDArray[np.float64]) -> Figure:
     """A mirror command at the actuators' positions, in percent of full stroke.
 
     Parameters
@@ -210,7 +206,7 @@ def mirror_without_grid(
         Actuator positions ``(n_act, 2)`` as (x, y), y along the rows of other figures.
     """
     values = 100 * np.asarray(command, float)
-    figure, axes, limit = _mirror_axes(values, title)
+    figure, axes, limit = _mirror_axes(values)
     distance = np.hypot(*(places_m[:, None, k] - places_m[:, k] for k in (0, 1)))
     np.fill_diagonal(distance, np.inf)
     radius = 0.5 * float(np.median(distance.min(axis=1))) if len(places_m) > 1 else 1.0
@@ -222,12 +218,12 @@ def mirror_without_grid(
     return figure
 
 
-def _mirror_axes(values: NDArray[np.float64], title: str) -> tuple[Figure, Axes, float]:
+def _mirror_axes(values: NDArray[np.float64]) -> tuple[Figure, Axes, float]:
     """Figure, axes and the ends of the colour scale for a command in percent."""
     limit = max(float(np.nanmax(np.abs(values), initial=0.0)), 1.0)
     figure = style.new_figure(4.4, 3.7)
     axes = style.hide_axes(figure.subplots())
-    axes.set_title(title, color=style.INK, fontsize=9.5)
+    axes.set_title("mirror command", color=style.INK, fontsize=9.5)
     style.colour_bar(figure, [axes], style.DIVERGING, (-limit, limit), "command [% of full stroke]")
     return figure, axes, limit
 

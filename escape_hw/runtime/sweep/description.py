@@ -20,7 +20,7 @@ from escape_hw.io.storage import write_atomic
 from escape_hw.runtime.procedures.model_psf import model_psf
 from escape_hw.runtime.sweep.design import METRICS, Design, MatrixVariant, Sweep, current_keys
 from escape_hw.runtime.sweep.search_space import DELAY_KEY, Parameter, format_value, parse_parameter
-from escape_hw.runtime.sweep.study import SAMPLERS, STORAGE_TIMEOUT_S, SweepStudy, redact_password
+from escape_hw.runtime.sweep.study import SAMPLERS, SweepStudy, redact_password
 
 DESCRIPTION_FILE = "sweep.json"
 
@@ -73,7 +73,7 @@ class SweepDescription:
             "sampler": self.sampler,
         }
 
-    def open_study(self, timeout_s: float = STORAGE_TIMEOUT_S) -> SweepStudy:
+    def open_study(self) -> SweepStudy:
         """The study.
 
         Raises
@@ -82,9 +82,8 @@ class SweepDescription:
             See :class:`~escape_hw.runtime.sweep.study.SweepStudy`.
         """
         return SweepStudy(
-            self.sweep, self.storage, self.study, self.settings(), use_tpe=self.sampler == "tpe",
-            timeout_s=timeout_s,
-        )  # fmt: skip
+            self.sweep, self.storage, self.study, self.settings(), use_tpe=self.sampler == "tpe"
+        )
 
     def save(self, folder: Path) -> Path:
         """Write :data:`DESCRIPTION_FILE` into a folder, without the storage's password.

@@ -19,6 +19,7 @@ from escape_hw.api.device import Device
 from escape_hw.api.sensor import SensorGeometry
 from escape_hw.bench import Bench
 from escape_hw.io.provenance import format_utc, get_software_version
+from escape_hw.pipeline.statistics import root_mean_square
 from escape_hw.remote.state import (
     DeviceHealth,
     DeviceState,
@@ -150,7 +151,7 @@ class StatePublisher:
             self._clipped.popleft()
         _, clipped, sent = (b - a for a, b in zip(self._clipped[0], self._clipped[-1], strict=True))
         return MirrorState(
-            rms=float(np.sqrt(np.mean(np.square(command)))),
+            rms=root_mean_square(command),
             peak=float(np.abs(command).max(initial=0.0)),
             saturated_share=clipped / (sent * command.size) if sent > 0 else 0.0,
             flatten_count=dm.flatten_count,

@@ -14,7 +14,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from escape_hw.errors import StorageError
-from escape_hw.streams.recording.recorder import MIN_FREE_BYTES, RecordingProgress, StreamRecorder
+from escape_hw.streams.recording.recorder import RecordingProgress, StreamRecorder
 from escape_hw.supervision import BackgroundThread, ChildProcess, watch_standard_input
 
 log = logging.getLogger(__name__)
@@ -31,20 +31,10 @@ class RecorderProcess:
     It ends by itself after ``seconds``, if given. Raises ``StorageError`` if the process cannot be started.
     """
 
-    def __init__(
-        self,
-        folder: Path,
-        streams: Mapping[str, str],
-        *,
-        seconds: float | None = None,
-        min_free_bytes: int = MIN_FREE_BYTES,
-    ) -> None:
+    def __init__(self, folder: Path, streams: Mapping[str, str], *, seconds: float | None = None) -> None:
         self.folder, self.seconds = folder, seconds
         self._state = RecordingProgress()
-        request = {
-            "folder": str(folder), "streams": dict(streams), "min_free_bytes": min_free_bytes,
-            "seconds": seconds,
-        }  # fmt: skip
+        request = {"folder": str(folder), "streams": dict(streams), "seconds": seconds}
         try:
             self._process = ChildProcess(
                 __name__, json.dumps(request), stdin=subprocess.PIPE, stdout=subprocess.PIPE
@@ -97,9 +87,7 @@ def main() -> None:
         except BrokenPipeError:
             stop.set()
 
-    recorder = StreamRecorder(
-        Path(request["folder"]), request["streams"], min_free_bytes=request["min_free_bytes"]
-    )
+    recorder = StreamRecorder(Path(request["folder"]), request["streams"])
     end_s = math.inf if request["seconds"] is None else time.monotonic() + request["seconds"]
     recorder.run(lambda: stop.is_set() or time.monotonic() > end_s, print_state)
 

@@ -34,13 +34,6 @@ def pitch_on_pupil(config: SystemConfig) -> float:
     return config.system.pupil_m / config.devices.dm.pitches_across_pupil
 
 
-def layout_positions(layout: NDArray[np.bool_], pitch_m: float) -> NDArray[np.float64]:
-    """Actuator positions ``(n_act, 2)`` as (x, y) in metres, in row-major order of the layout."""
-    rows, columns = np.nonzero(layout)
-    centre = (np.array(layout.shape[::-1]) - 1) / 2
-    return (np.stack([columns, rows], axis=1) - centre) * pitch_m
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class InfluenceFunctions:
     """Influence functions with a radial profile that is a sum of Gaussians.

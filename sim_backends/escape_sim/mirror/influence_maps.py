@@ -17,10 +17,10 @@ from scipy.sparse import diags, identity, kron, vstack
 from scipy.sparse.linalg import splu
 
 from escape_hw.api.influence import PLACE_CARDS
+from escape_hw.array_files import read_array
 from escape_hw.bounded_files import MAX_ARRAY_BYTES, read_bounded
 from escape_hw.calibration.sprint.influence_shape import find_edge_actuators
 from escape_hw.errors import ConfigError, ProductError
-from escape_hw.io.interchange.arrays import read_array
 
 #: Metres in the units of heights and of pixels.
 _METRES = {"m": 1.0, "metre": 1.0, "mm": 1e-3, "um": 1e-6, "micrometre": 1e-6, "nm": 1e-9, "nanometre": 1e-9}

@@ -60,6 +60,10 @@ class DesignModel:
         """Size of a sub-aperture, or of a pixel of the pupil image, on the pupil in metres."""
         return self._pupil.sub_aperture_m
 
+    def influence_functions(self) -> tuple[NDArray[np.float64], NDArray[np.bool_], float]:
+        """Nominal influence functions over the pupil, see :class:`SyntheticModel`."""
+        return self._surfaces(self._pupil.coordinates_m), self._pupil.lit, self._pupil.pixel_m
+
     def surface_model(self, x_m: NDArray[np.float64], y_m: NDArray[np.float64]) -> SurfaceModel:
         """The same mirror on a sensor of heights, see :class:`HasSurfaces`."""
         model = SurfaceModel(self._config, self._pupil, x_m, y_m)
@@ -142,10 +146,6 @@ class SurfaceModel(DesignModel):
     ) -> None:
         super().__init__(config, pupil)
         self._x_m, self._y_m = x_m, y_m
-
-    def influence_functions(self) -> tuple[NDArray[np.float64], NDArray[np.bool_], float]:
-        """Nominal influence functions over the pupil, see :class:`SyntheticModel`."""
-        return self._surfaces(self._pupil.coordinates_m), self._pupil.lit, self._pupil.pixel_m
 
     def zonal_matrix(self, registration: Registration, width: float = 1.0) -> NDArray[np.float64]:
         """Heights per unit command ``(n_y * n_x, n_act)`` in fractions of full stroke."""

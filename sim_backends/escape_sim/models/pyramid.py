@@ -170,10 +170,6 @@ class PyramidModel(DesignModel):
             lit = np.ones_like(lit)
         return np.tile(np.where(lit, 1.0, _MIN_SLOPE_WEIGHT), 2)
 
-    def influence_functions(self) -> tuple[NDArray[np.float64], NDArray[np.bool_], float]:
-        """Nominal influence functions for the modal basis, see :class:`SyntheticModel`."""
-        return self._surfaces(self._pupil.coordinates_m), self._pupil.lit, self._pupil.pixel_m
-
     def zonal_matrix(self, registration: Registration, width: float = 1.0) -> NDArray[np.float64]:
         """Slopes per unit command ``(n_slopes, n_act)``, see :class:`SyntheticModel`; single precision."""
         if not self._is_separable(registration):

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from escape_hw.array_files import load_arrays
 from escape_hw.errors import ConfigError, IncompatibleProduct, ProductError
-from escape_hw.io.arrays import load_arrays
 from escape_hw.io.documents import to_plain_values
 from escape_hw.io.provenance import get_software_version
 from escape_hw.io.storage import write_atomic
