@@ -19,6 +19,8 @@ SMALL = (
     "loop.dropped_modes=4",
     "twin.wfs.photons_per_frame=2.5e6",
 )
+#: A nominal mirror with Gaussian influence functions, for tests whose reference has such a mirror.
+GAUSSIAN = ("devices.dm.influence=gaussian", "devices.dm.coupling=0.4")
 
 
 def configuration(*more: str, seed: int | None = None) -> SystemConfig:

@@ -235,7 +235,7 @@ class DriftingSurface:
         return steps[number]((1 - share) * command) + steps[number + 1](share * command)
 
     def _surface_of_step(self, number: int) -> SurfaceFunction:
-        """Surface function for the middle of interval ``number``, or for its start if they are interpolated."""
+        """Surface function for the middle of interval ``number``; if they are interpolated, for its start."""
         time_s = 0.0
         if math.isfinite(self._interval_s):
             time_s = (number if self._interpolated else number + 0.5) * self._interval_s
