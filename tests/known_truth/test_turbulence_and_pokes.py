@@ -80,8 +80,8 @@ def test_the_mean_response_beside_pokes_is_that_of_frames(pupils: PyramidPupils)
         seen.append((up - down) / (2 * step))
     mean = np.mean(seen, axis=0)
     noise = np.std(seen, axis=0).mean() / np.sqrt(len(seen))
-    # The mean is computed from the second moments of the pokes' phases. With the pointed influence functions of
-    # this mirror 12 % remain, and a gain of 0.963 from 600 states; with Gaussian ones 7 % and 0.980.
+    # The mean is computed from the second moments of the pokes' phases. With the pointed influence functions
+    # of this mirror 12 % remain, and a gain of 0.963 from 600 states; with Gaussian ones 7 % and 0.980.
     assert np.sqrt(np.mean(np.square(mean - want))) < 0.1 * np.std(want) + 1.5 * noise
     assert np.vdot(mean, want) / np.vdot(want, want) == pytest.approx(1.0, abs=0.05)
 
