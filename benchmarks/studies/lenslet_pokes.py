@@ -36,6 +36,7 @@ FRACTIONS = (0.25, 0.5, 1.0)
 #: Counts of the brightest pixel on a flat wavefront.
 PEAK_COUNTS = 150.0
 IDEAL = (
+    "devices.dm.influence=gaussian", "twin.mirror.shape=gaussian",
     "twin.mirror.gain_scatter=0", "twin.mirror.width_scatter=0", "twin.mirror.wing_fraction=0",
     "twin.ncpa.rms_m=0", "twin.wfs.fixed_pattern=0",
 )  # fmt: skip

@@ -8,8 +8,8 @@ Each realisation is a twin with all its imperfections, shifted by up to a sub-ap
 degrees and scaled by up to 4 %. On a telescope ``--contaminated`` is the share of the circumference that dirt
 covers: 0.28, to a fifth of the radius, are a tenth of the pupil, and 0 is a clean and evenly lit one. With
 ``--dm97`` the mirror is drawn anew in every realisation, as measured ALPAO DM97-15 mirrors are, and the
-nominal one has an exponential profile. Realisations below 1000 are for development; no constant and no
-method is ever chosen on those from 1000 on, which are for validation. Writes
+nominal one has an exponential profile, as on the RAZOR systems without it. Realisations below 1000 are for
+development; no constant and no method is ever chosen on those from 1000 on, which are for validation. Writes
 ``realisations-SYSTEM-NAME.jsonl``: appends one line per realisation; realisations already in the file are
 skipped. Prints rms error, mean error and normalised chi-squared of those that converged, and the rms error of
 the images' mean place in pixels. A realisation takes about half a minute on an idle core.

@@ -42,7 +42,8 @@ _TWIN = (
     "sensor.n_sub=12", "sensor.beam_radius_m=inf", "devices.wfs.region=[220,156,200,200]",
     'devices.dm.layout="circle-7"', "devices.dm.pitches_across_pupil=5.0", "devices.dm.pitch_m=2.7e-3",
     "devices.screen.screen=0", "basis.kind=zonal", "basis.n_modes=37", "calibration.sprint_modes=37",
-    "twin.mirror.shape=exponential", "twin.mirror.wing_fraction=0",
+    "devices.dm.influence=gaussian", "devices.dm.coupling=0.4",
+    "twin.mirror.shape=exponential", "twin.mirror.coupling=0.43", "twin.mirror.gain_scatter=0.05",
 )  # fmt: skip
 
 

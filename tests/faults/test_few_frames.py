@@ -45,7 +45,8 @@ def test_stated_errors_against_the_truth(good, short_runs, frames, whiten):
         chi2.append(np.mean(np.square(errors)))
         gains.append(gain)
     assert 0.5 < np.mean(chi2) < 2
-    assert np.abs(np.array(gains) - 1).max() < (0.25 if whiten else 0.5)
+    # It scatters by 12 % over twelve runs of 82 frames; by 8 % on a mirror with Gaussian influence functions.
+    assert np.abs(np.array(gains) - 1).max() < (0.3 if whiten else 0.5)
 
 
 def test_errors_grow_towards_the_limit(short_runs):

@@ -66,8 +66,12 @@ def test_right_within_its_errors_whatever_the_loop_does(closed_loop, name, seeds
 
 
 def test_smaller_pokes_and_more_frames_give_larger_errors_and_smaller_ones(closed_loop):
-    strong, weak = measured(closed_loop), measured(closed_loop, poke=0.004)
-    assert (weak.registration.sigma[:3] > 1.3 * strong.registration.sigma[:3]).all()
+    strong, weak = measured(closed_loop), measured(closed_loop, poke=0.002)
+    # Those between runs: the unequal actuators, in both alike, are most of the others.
+    errors = [one.registration.repeatability_sigma for one in (weak, strong)]
+    assert errors[0] is not None
+    assert errors[1] is not None
+    assert (errors[0][:3] > 1.3 * errors[1][:3]).all()
     assert np.abs(pull(weak)).max() < 5
 
 

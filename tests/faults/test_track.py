@@ -73,7 +73,7 @@ def test_a_drift_is_followed_and_exchanged_without_a_transient(start, monkeypatc
 
     monkeypatch.setattr(LeakyIntegrator, "__call__", answered)
     monkeypatch.setattr(LeakyIntegrator, "set_reconstructor", swapped)
-    with small(QUIET, "twin.drift.rate.shift_x=1.0") as bench:
+    with small(QUIET, "twin.drift.rate.shift_x=1.5") as bench:
         origin = bench.dm.twin.now_s
         found = followed(bench, start, 9)
         truth = np.array([bench.dm.twin.flexure.at(origin + t).shift_x for t in found.rows["seconds"]])

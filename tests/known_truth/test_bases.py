@@ -13,7 +13,7 @@ SMALL = (
     "sensor.n_sub=12", "sensor.beam_radius_m=inf", "devices.wfs.region=[220,156,200,200]",
     'devices.dm.layout="circle-7"', "devices.dm.pitches_across_pupil=5.0", "devices.dm.pitch_m=2.7e-3",
     "devices.screen.screen=2", "basis.n_modes=25", "calibration.sprint_modes=25", "loop.dropped_modes=4",
-    "twin.wfs.photons_per_frame=2.5e6", "twin.mirror.wing_fraction=0", "twin.mirror.gain_scatter=0.02",
+    "twin.wfs.photons_per_frame=2.5e6", "twin.mirror.gain_scatter=0.02",
 )  # fmt: skip
 INJECTED = np.array([-16.0, -71.0, -0.77, 2.9, 0.0])
 #: What counts as found, in the units of the parameters, on sub-apertures twice as wide as the bench's.
@@ -57,8 +57,8 @@ def test_few_frames_do_with_any_basis(kind):
 
 @pytest.mark.parametrize("solver", ["registration-only", "frozen-derivatives", "batches", "diagonal"])
 def test_every_solver_gives_the_registration(solver):
-    # These know no unequal actuators and no wrong coupling, so the mirror is like its model here.
-    ideal = ("twin.mirror.coupling=0.4", "twin.mirror.gain_scatter=0", "twin.mirror.width_scatter=0")
+    # These know no unequal actuators and no other shape, so the mirror is like its model here.
+    ideal = ("twin.mirror.shape=nominal", "twin.mirror.gain_scatter=0")
     result = calibrated(
         f"calibration.solver={solver}", "calibration.learning_rate=0.3", *ideal, estimator="matrix"
     )

@@ -30,7 +30,7 @@ INJECTED = Registration(-16.0, 31.0, -0.77, 1.9, 0.5)
 SEEDS = range(5)
 #: Noise of a matrix element relative to the rms of the matrix, and of a pixel of the maps to their peak.
 NOISE, MAP_NOISE = 0.1, 0.001
-CONFIG = small_system.configuration()
+CONFIG = small_system.configuration(*small_system.GAUSSIAN)
 POSITIONS, PITCH = actuator_positions(CONFIG), pitch_on_pupil(CONFIG)
 #: Pixels of the maps: an interferometer of 9 pixels per pitch that sees 3.6 pitches around the centre.
 STEP = 9
@@ -137,7 +137,7 @@ def test_the_error_of_the_place_of_the_maps_is_stated(
 
 @pytest.mark.parametrize("shape", ["file", "thin-plate"])
 def test_derivatives_of_a_pyramid_with_a_mirror_of_any_shape(shape: str, tmp_path: Path) -> None:
-    config = small_pyramid.configuration()
+    config = small_pyramid.configuration(*small_system.GAUSSIAN)
     at, pitch = actuator_positions(config), pitch_on_pupil(config)
     mirror = InfluenceFunctions(at, pitch, config.devices.dm.coupling)
     reach = AXIS * pitch * 1.3
@@ -159,7 +159,7 @@ def test_derivatives_of_a_pyramid_with_a_mirror_of_any_shape(shape: str, tmp_pat
     m2c = np.eye(model.n_act)[:, :3]
     assert model.modal_jacobian(INJECTED, m2c, 1.05)[1] == pytest.approx(derivatives @ m2c)
     if shape == "file":
-        gaussian = PyramidModel(small_pyramid.configuration(), nominal_pupils(config))
+        gaussian = PyramidModel(small_pyramid.configuration(*small_system.GAUSSIAN), nominal_pupils(config))
         want = gaussian.zonal_matrix(INJECTED, 1.05)
         assert np.linalg.norm(matrix - want) < 0.01 * np.linalg.norm(want)
 

@@ -24,7 +24,7 @@ from escape_sim.optics.pupil import pupil_geometry
 
 #: The paper's laboratory case, and one with everything far out.
 PLACES = [Registration(-16.0, -71.0, -0.77, 2.9, 0.0), Registration(310.0, -190.0, 9.0, -6.0, 7.0)]
-STEPS = np.array([1.0, 1.0, 0.03, 0.1, 0.1, 0.003])
+STEPS = np.array([0.6, 0.6, 0.02, 0.06, 0.06, 0.002])
 
 
 class Plain:

@@ -12,8 +12,8 @@ from escape_hw.config.registry import model_factory
 #: A little of everything that a twin can hide.
 HIDDEN = (
     "twin.registration.shift_x=43.0", "twin.registration.rotation=3.0",
-    "twin.registration.radial_scaling=-5.0",
-    "twin.registration.anamorphosis_angle=20.0", "twin.mirror.gain_scatter=0.2", "twin.mirror.coupling=0.3",
+    "twin.registration.radial_scaling=-5.0", "twin.registration.anamorphosis_angle=20.0",
+    "twin.mirror.shape=gaussian", "twin.mirror.gain_scatter=0.2", "twin.mirror.coupling=0.3",
     "twin.mirror.width_scatter=0.1", "twin.mirror.wing_fraction=0.1", "twin.mirror.settling_s=2e-3",
     "twin.wfs.photons_per_frame=1e4", "twin.wfs.read_noise_e=50", "twin.wfs.fixed_pattern=0.1",
     "twin.vibration.amplitude_rad=[1e-4,1e-4]", "twin.ncpa.rms_m=2e-7", "twin.latency_s=2e-3",

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import tomllib
 from dataclasses import replace
-from importlib.resources import files
 
 import numpy as np
 import pytest
+from small_system import GAUSSIAN
 
 from escape_hw.api.registration import Registration
 from escape_hw.api.synthetic_model import SyntheticModel
+from escape_hw.config.loader import load_system
 from escape_hw.config.system import SystemConfig
 from escape_hw.errors import CalibrationError
 from escape_sim.models.factory import make_fast_model
@@ -25,8 +25,7 @@ TOLERANCE = 1e-6
 
 @pytest.fixture(scope="module")
 def config() -> SystemConfig:
-    text = (files("escape_hw.config") / "systems" / "razor-shwfs.toml").read_text()
-    return SystemConfig.model_validate(tomllib.loads(text))
+    return load_system("razor-shwfs", overrides=GAUSSIAN)
 
 
 @pytest.fixture(scope="module")

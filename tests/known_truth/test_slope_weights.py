@@ -11,7 +11,7 @@ from scipy.special import ndtri
 from escape_hw.api.registration import Registration
 from escape_hw.config.loader import load_system
 from escape_hw.pipeline.slopes.shack_hartmann import subaperture_windows
-from escape_sim.mirror.influence_functions import InfluenceFunctions, actuator_positions, pitch_on_pupil
+from escape_sim.mirror.nominal import nominal_influence_functions
 from escape_sim.models.shack_hartmann import (
     NEIGHBOURS,
     ShackHartmannModel,
@@ -73,9 +73,7 @@ class Truth:
 
 def surfaces(config, registration, width=1.0):
     pupil = pupil_geometry(config)
-    influence = InfluenceFunctions(
-        actuator_positions(config), pitch_on_pupil(config), config.devices.dm.coupling, width
-    )
+    influence = replace(nominal_influence_functions(config), width=width)
     x = pupil.coordinates_m
     return influence.surfaces(registration, pupil.sub_aperture_m, x, x)
 

@@ -39,8 +39,9 @@ def test_every_parameter_follows_its_rate_and_its_sinusoid():
     assert flexure.at(6.0).shift_y == pytest.approx(-10.0)
 
 
-def test_the_surface_is_that_of_the_registration_of_the_moment():
-    twin = bench()
+@pytest.mark.parametrize("shape", ["gaussian", "exponential"])
+def test_the_surface_is_that_of_the_registration_of_the_moment(shape):
+    twin = bench(f"twin.mirror.shape={shape}")
     x, sub = twin.pupil.coordinates_m, twin.pupil.sub_aperture_m
     flexure = Flexure(START, DRIFT)
     moving = DriftingSurface(twin.influence, flexure, sub, x, x)
@@ -54,6 +55,20 @@ def test_the_surface_is_that_of_the_registration_of_the_moment():
         assert np.abs(moving(command, time_s) - exact).std() < 0.05 * moved.std() < 0.1 * scale
     again = DriftingSurface(twin.influence, flexure, sub, x, x)
     np.testing.assert_array_equal(again(command, 1.2), moving(command, 1.2))
+
+
+def test_surfaces_that_are_no_products_are_computed_once_per_per_cent(monkeypatch):
+    twin, computed = bench("twin.mirror.shape=exponential", "twin.drift.rate.shift_x=0.5"), []
+    make = make_mirror_surface
+
+    def counted(*given):
+        computed.append(given)
+        return make(*given)
+
+    monkeypatch.setattr("escape_sim.mirror.surface.make_mirror_surface", counted)
+    for time_s in np.arange(0, 4, 0.02):
+        twin.mirror_opd(np.zeros(97), time_s)
+    assert len(computed) <= 3
 
 
 def test_a_bench_without_drift_is_computed_once(monkeypatch):

@@ -57,9 +57,12 @@ CAPTURE_TOLERANCE = np.array([5.0, 5.0, 0.1, 0.5, 0.5])
 _REGISTRATION_ONLY: tuple[str, Solver] = ("registration only", "registration-only")
 _WITH_MISFIT: tuple[str, Solver] = ("with misfit", "mixed-effects")
 _SOLVERS = (_REGISTRATION_ONLY, _WITH_MISFIT)
-_OOPAO_SENSOR = ("sensor.pitch_px=16", "sensor.spot_px=2")
+#: The mirror of every peer's model.
+_GAUSSIAN = ("devices.dm.influence=gaussian", "devices.dm.coupling=0.4")
+_OOPAO_SENSOR = (*_GAUSSIAN, "sensor.pitch_px=16", "sensor.spot_px=2")
 #: OOPAO's pupil images stand on a square around the middle of its grid.
 _OOPAO_PYRAMID = (
+    *_GAUSSIAN,
     "devices.wfs.region=[248, 184, 144, 144]",
     "sensor.pupils_px=[[35.5, 35.5], [107.5, 35.5], [35.5, 107.5], [107.5, 107.5]]",
 )
@@ -74,7 +77,7 @@ Solve = Callable[[NDArray[np.float64]], SolverResult]
 
 def run() -> list[BenchmarkRow]:
     """All rows of the stage."""
-    bench = load_system("razor-shwfs")
+    bench = load_system("razor-shwfs", overrides=_GAUSSIAN)
     oopao_like = load_system("razor-shwfs", overrides=_OOPAO_SENSOR)
     rows = []
     for modes in _low_modes(bench):

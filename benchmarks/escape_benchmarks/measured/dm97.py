@@ -43,6 +43,7 @@ _DESIGN = (
     "devices.wfs.sensor_px=[2048,2048]", "devices.wfs.region=[0,0,2048,2048]", "devices.wfs.bit_depth=12",
     # A beam of 9 mm shows 13.5 mm of the mirror, so the pitch of an actuator is 1 mm on the lenslets.
     f"devices.dm.pitches_across_pupil={ACROSS * 0.3}",
+    "devices.dm.influence=gaussian", "devices.dm.coupling=0.4",
 )  # fmt: skip
 
 

@@ -8,7 +8,7 @@ mirror then appears to have moved with them, and only the rims separate the two.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,6 +22,9 @@ from escape_hw.errors import ConfigError
 
 #: Prior standard deviations: shear in % of the diameter, shift of the images in % of a sub-aperture.
 _SHEAR_SIGMA, _PUPIL_SHIFT_SIGMA = 2.0, 20.0
+#: Zonal matrix ``(n_slopes, n_act)`` of the fitted profile of the influence functions, with the sensor of a
+#: model, under a registration.
+ProfileMatrix = Callable[[SyntheticModel, Registration], NDArray[np.float64]]
 #: Value, in prior standard deviations, below which a symmetric difference about zero is used.
 _SMALL_VALUE = 0.01
 
@@ -48,24 +51,24 @@ class Anamorphosis:
         return float(registration_systematic_error[3:].max())
 
     def matrix_change(
-        self, registration: Registration, width: float, scaled_value: float
+        self, profile_matrix: ProfileMatrix, registration: Registration, scaled_value: float
     ) -> NDArray[np.float64]:
         """Change of the zonal matrix ``(n_slopes, n_act)`` per prior standard deviation.
 
         Parameters
         ----------
-        registration, width
-            As for :meth:`~escape_hw.api.synthetic_model.SyntheticModel.zonal_matrix`.
+        profile_matrix, registration
+            Matrix of the fitted profile, and the registration at which to change it.
         scaled_value
             Present value in prior standard deviations; multiplied with it the change is exact.
         """
 
         def at(value: float) -> NDArray[np.float64]:
-            return self.model.zonal_matrix(registration.with_shear(value * self.prior_sigma), width)
+            return profile_matrix(self.model, registration.with_shear(value * self.prior_sigma))
 
         if abs(scaled_value) < _SMALL_VALUE:
             return np.asarray((at(_SMALL_VALUE) - at(-_SMALL_VALUE)) / (2 * _SMALL_VALUE))
-        return np.asarray((at(scaled_value) - self.model.zonal_matrix(registration, width)) / scaled_value)
+        return np.asarray((at(scaled_value) - at(0.0)) / scaled_value)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -91,11 +94,10 @@ class PupilShift:
         return 0.0
 
     def matrix_change(
-        self, registration: Registration, width: float, scaled_value: float
+        self, profile_matrix: ProfileMatrix, registration: Registration, scaled_value: float
     ) -> NDArray[np.float64]:
         """As for :class:`Anamorphosis`, to first order."""
-        unshifted = self.model.zonal_matrix(registration, width)
-        return np.asarray(self.moved.zonal_matrix(registration, width) - unshifted)
+        return np.asarray(profile_matrix(self.moved, registration) - profile_matrix(self.model, registration))
 
 
 #: A number that SPRINT fits beside the registration.

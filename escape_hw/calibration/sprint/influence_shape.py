@@ -159,18 +159,12 @@ class InfluenceShape:
         are taken from ``terms``, those of :meth:`linearise` nearby.
         """
         n = len(self._widths)
-        weights, kept = coefficients[:n, None] * np.ones(self._model.n_act), coefficients.copy()
-        edge_gain: NDArray[np.float64] | float = 1.0
+        weights, edge_gain = self._profile_weights(coefficients)
+        kept = coefficients.copy()
         if self._edge is not None:
             first = n + len(_FOURFOLD_LOBES)
-            edge_gain = 1 + coefficients[first] * self._edge
-            edge_profile = slice(first + 2, first + 2 + n)
-            weights = weights * edge_gain + coefficients[edge_profile, None] * self._edge
             kept[first] = 0.0
-            kept[edge_profile] = 0.0
-        # The functions of the profile replace the first one.
-        weights = np.concatenate([-weights.sum(axis=0, keepdims=True), weights])
-        weights += self._shares[:, None] * edge_gain
+            kept[first + 2 : first + 2 + n] = 0.0
         functions = zip(weights, PROFILE_WIDTHS, strict=True)
         matrix = zonal_sum(self._model, [(w, registration, width * relative) for w, relative in functions])
         if self._given is not None:
@@ -179,6 +173,49 @@ class InfluenceShape:
             is_fourfold = number < n + len(_FOURFOLD_LOBES)
             matrix += kept[number] * (edge_gain * terms[number] if is_fourfold else terms[number])
         return matrix
+
+    def profile_matrix(
+        self,
+        model: SyntheticModel,
+        registration: Registration,
+        width: float,
+        coefficients: NDArray[np.float64],
+    ) -> NDArray[np.float64]:
+        """Zonal matrix ``(n_slopes, n_act)`` of the radial profiles, without the terms that have a direction.
+
+        Parameters
+        ----------
+        model
+            The synthetic model, or one of the same mirror on another sensor.
+        registration, width, coefficients
+            As for :meth:`linearise`; the registration may have an anamorphosis angle.
+        """
+        weights, edge_gain = self._profile_weights(coefficients)
+        component = model.component_model() if isinstance(model, HasProfile) else model
+        matrix = np.zeros(())
+        for weight, relative_width in zip(weights, PROFILE_WIDTHS, strict=True):
+            if np.any(weight):
+                matrix = matrix + weight * component.zonal_matrix(registration, width * relative_width)
+        if self._given is not None:
+            matrix = matrix + edge_gain * model.zonal_matrix(registration, width)
+        return matrix
+
+    def _profile_weights(
+        self, coefficients: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64] | float]:
+        """Share of each width of the profile ``(n_widths, n_act)``, and gain of the edge actuators."""
+        n = len(self._widths)
+        weights = coefficients[:n, None] * np.ones(self._model.n_act)
+        edge_gain: NDArray[np.float64] | float = 1.0
+        if self._edge is not None:
+            first = n + len(_FOURFOLD_LOBES)
+            edge_gain = 1 + coefficients[first] * self._edge
+            edge_profile = slice(first + 2, first + 2 + n)
+            weights = weights * edge_gain + coefficients[edge_profile, None] * self._edge
+        # The functions of the profile replace the first one.
+        weights = np.concatenate([-weights.sum(axis=0, keepdims=True), weights])
+        weights += self._shares[:, None] * edge_gain
+        return weights, edge_gain
 
     def _outward_derivative(self, jacobian: NDArray[np.float64]) -> NDArray[np.float64]:
         """Derivative by outward positions of the actuators ``(n_slopes, n_act)``."""

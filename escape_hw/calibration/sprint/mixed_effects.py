@@ -196,9 +196,13 @@ class MixedEffectsProblem:
             changed, changes = zonal_jacobian(variant, registration, w)
             variants.append(changed - shaped.nominal)
             jacobian = jacobian + share * (changes - shaped.base)
+
+        def profile_matrix(model: SyntheticModel, at: Registration) -> NDArray[np.float64]:
+            return self.shape.profile_matrix(model, at, w, state.shape)
+
         first = len(self.variants)
         for extra, share in zip(self.extras, state.variant[first:], strict=False):
-            variants.append(extra.matrix_change(registration, w, float(share)))
+            variants.append(extra.matrix_change(profile_matrix, registration, float(share)))
         variants += [shaped.nominal @ command_curve for command_curve in self.command_curves]
         z = _ZonalMatrices(jacobian, jacobian[5] * w, shaped.terms, variants, shaped.matrix)
         z.total = self._add_effects(shaped.matrix, state, z)

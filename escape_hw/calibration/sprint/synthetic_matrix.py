@@ -68,19 +68,25 @@ def compute_fitted_jacobian(
     """
     registration, width = estimate.registration, estimate.width.value
     corrections = estimate.actuator_corrections
-    scaled_modes, variance = m2c, 0.0
+    scaled_modes, variance, shape = m2c, 0.0, InfluenceShape(model)
+    coefficients = np.zeros(shape.n_terms)
     if corrections is None:
         single, jacobian = zonal_jacobian(model, registration, width)
     else:
-        shaped = InfluenceShape(model).linearise(registration, width, corrections.shape)
+        coefficients[: corrections.shape.size] = corrections.shape
+        shaped = shape.linearise(registration, width, coefficients)
         jacobian, (along_x, along_y) = shaped.jacobian, corrections.position
         single = shaped.matrix + width * corrections.width * jacobian[5]
         single += along_x * jacobian[0] + along_y * jacobian[1]
         scaled_modes = (1 + corrections.gain)[:, None] * m2c
         variance = np.square(single) @ np.square(corrections.gain_sigma[:, None] * m2c)
+
+    def profile_matrix(other: SyntheticModel, at: Registration) -> NDArray[np.float64]:
+        return shape.profile_matrix(other, at, width, coefficients)
+
     for one in build_fitted_extra_parameters(model, estimate.extras):
         scaled_value = estimate.extras[one.name].value / one.prior_sigma
-        single = single + scaled_value * one.matrix_change(registration, width, scaled_value)
+        single = single + scaled_value * one.matrix_change(profile_matrix, registration, scaled_value)
     unit = single @ scaled_modes
     return unit, jacobian @ scaled_modes, np.broadcast_to(variance, unit.shape)
 

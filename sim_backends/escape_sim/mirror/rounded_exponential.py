@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from escape_hw.api.registration import Registration
@@ -59,23 +61,32 @@ class ExponentialInfluenceFunctions:
         """Surfaces per unit command ``(n_act, n_y, n_x)``, fractions of full stroke."""
         matrix, offset = registration.affine(sub_aperture_m)
         inverse = np.linalg.inv(matrix) / self.pitch_m
-        x, y = x_m - offset[0], y_m - offset[1]
-        out = np.empty((self.n_act, y_m.size, x_m.size))
         outward = self.positions_m / np.maximum(np.linalg.norm(self.positions_m, axis=1), 1e-12)[:, None]
-        for a, position in enumerate(self.positions_m / self.pitch_m):
-            u = inverse[0, 0] * x + inverse[0, 1] * y[:, None] - position[0]
-            v = inverse[1, 0] * x + inverse[1, 1] * y[:, None] - position[1]
-            r2 = u**2 + v**2
-            rounded2 = r2 + self.rounding[a] ** 2
-            profile = np.exp(-(np.sqrt(rounded2) - self.rounding[a]) / self.length[a])
-            if self.fourfold[a]:
-                # r^4 cos(4 theta) as a polynomial.
-                profile *= 1 + self.fourfold[a] * (u**4 - 6 * u**2 * v**2 + v**4) / rounded2**2
-            if self.slope[a]:
-                along = u * outward[a, 0] + v * outward[a, 1]
-                profile *= 1 + self.slope[a] * along
-            out[a] = self.gain[a] * profile
+        out = np.empty((self.n_act, y_m.size, x_m.size))
+        _fill_surfaces(
+            x_m - offset[0], y_m - offset[1], inverse, self.positions_m / self.pitch_m, outward, self.length,
+            self.rounding, self.gain, self.fourfold, self.slope, out,
+        )  # fmt: skip
         return out
+
+
+@njit(cache=True, fastmath=True, nogil=True)
+def _fill_surfaces(  # type: ignore[no-untyped-def]  # pragma: no cover
+    x, y, inverse, position, outward, length, rounding, gain, fourfold, slope, out
+):
+    for a in range(out.shape[0]):
+        w = rounding[a]
+        for i in range(y.size):
+            for j in range(x.size):
+                u = inverse[0, 0] * x[j] + inverse[0, 1] * y[i] - position[a, 0]
+                v = inverse[1, 0] * x[j] + inverse[1, 1] * y[i] - position[a, 1]
+                u2, v2 = u * u, v * v
+                rounded2 = u2 + v2 + w * w
+                profile = gain[a] * math.exp((w - math.sqrt(rounded2)) / length[a])
+                # r^4 cos(4 theta) as a polynomial.
+                fourth = (u2 * u2 - 6 * u2 * v2 + v2 * v2) / (rounded2 * rounded2)
+                outwards = u * outward[a, 0] + v * outward[a, 1]
+                out[a, i, j] = profile * (1 + fourfold[a] * fourth) * (1 + slope[a] * outwards)
 
 
 #: Ranges of the measured ALPAO DM97-15 mirrors: length and rounding in pitches, four-fold term.

@@ -125,46 +125,48 @@ def _add_windows(command, terms, along_x, along_y, left, right, top, bottom, out
 
 
 class GriddedSurface:
-    """Influence functions of any shape ``(n_act, n_y, n_x)``, each added on the samples that it reaches."""
+    """Influence functions of any shape ``(n_act, n_y, n_x)``, each added on the samples that it reaches.
+
+    The samples are stored by rows, all actuators of a row together: reading them takes most of the time.
+    """
 
     def __init__(self, surfaces: NDArray[np.float64]) -> None:
         size = np.abs(surfaces)
         threshold = NEGLIGIBLE_HEIGHT * float(size.max())
-        self._top, self._bottom = _windows(size.max(axis=2).T, threshold)
-        self._left, self._right = _windows(size.max(axis=1).T, threshold)
-        patches = [
-            surface[t:b, a:z].astype(np.float32).ravel()
-            for surface, t, b, a, z in zip(
-                surfaces, self._top, self._bottom, self._left, self._right, strict=True
-            )
-        ]
-        self._start = np.concatenate([[0], np.cumsum([patch.size for patch in patches])])
-        self._patches = np.concatenate(patches)
-        self._shape = surfaces.shape[1:]
+        top, bottom = _windows(size.max(axis=2).T, threshold)
+        left, right = _windows(size.max(axis=1).T, threshold)
+        n_y, n_x = self._shape = surfaces.shape[1:]
+        rows, columns = np.arange(n_y)[:, None], np.arange(n_x)
+        reached = ((top <= rows) & (rows < bottom))[:, :, None] & (
+            (left[:, None] <= columns) & (columns < right[:, None])
+        )
+        self._samples = surfaces.transpose(1, 0, 2)[reached].astype(np.float32)
+        self._left, self._right, self._top, self._bottom = left, right, top, bottom
 
     def __call__(self, command: NDArray[np.float64]) -> NDArray[np.float32]:
         """Surface ``(n_y, n_x)`` in fractions of full stroke for a command ``(n_act,)``."""
         out = np.zeros(self._shape, np.float32)
-        _add_patches(
-            np.asarray(command, np.float32), self._patches, self._start, self._left, self._right, self._top,
-            self._bottom, out,
+        _add_rows(
+            np.asarray(command, np.float32), self._samples, self._left, self._right, self._top, self._bottom,
+            out,
         )  # fmt: skip
         return out
 
 
 @njit(cache=True, fastmath=True, nogil=True)
-def _add_patches(command, patches, start, left, right, top, bottom, out):  # type: ignore[no-untyped-def]  # pragma: no cover
-    for k in range(command.size):
-        weight = command[k]
-        width = right[k] - left[k]
-        if weight == 0 or width <= 0:
-            continue
-        for i in range(top[k], bottom[k]):
-            begin = start[k] + (i - top[k]) * width
-            line = patches[begin : begin + width]
-            target = out[i, left[k] : right[k]]
-            for j in range(width):
-                target[j] += weight * line[j]
+def _add_rows(command, samples, left, right, top, bottom, out):  # type: ignore[no-untyped-def]  # pragma: no cover
+    begin = 0
+    for i in range(out.shape[0]):
+        for k in range(command.size):
+            if top[k] <= i < bottom[k]:
+                weight = command[k]
+                line = samples[begin : begin + right[k] - left[k]]
+                begin += line.size
+                if weight == 0:
+                    continue
+                target = out[i, left[k] : right[k]]
+                for j in range(line.size):
+                    target[j] += weight * line[j]
 
 
 #: Largest change of each parameter, in its unit, before the surface is computed anew. The shifts'
@@ -175,7 +177,8 @@ _MAX_PARAMETER_CHANGE = np.array([0.01, 0.01, 3e-4, 0.003, 0.003])
 class Flexure:
     """True registration of the mirror as a function of time, from ``start`` at time zero.
 
-    ``update_interval_s`` is the time after which a parameter may have changed enough for a new surface.
+    ``update_interval_s`` is the time after which a parameter may have changed enough for a new surface;
+    between surfaces ``interpolation_interval_s`` apart linear interpolation is as accurate.
     """
 
     def __init__(self, start: Registration, drift: TwinDrift) -> None:
@@ -187,6 +190,8 @@ class Flexure:
             ((np.abs(rate) + np.abs(swing) * 2 * math.pi / drift.period_s) / _MAX_PARAMETER_CHANGE).max()
         )
         self.update_interval_s = 1 / max_rate if max_rate else math.inf
+        # The second bound is for sinusoids whose whole amplitude is less than a hundred changes.
+        self.interpolation_interval_s = min(100 * self.update_interval_s, drift.period_s / 64)
 
     def at(self, time_s: float) -> Registration:
         """Registration at a time of the twin's clock in seconds."""
@@ -197,8 +202,9 @@ class Flexure:
 class DriftingSurface:
     """Function from commands to surfaces under a drifting registration.
 
-    The surface is recomputed once per ``flexure.update_interval_s`` and depends on the time only.
-    Parameters as for :func:`make_mirror_surface`.
+    The surface depends on the time only. Separable influence functions are recomputed once per
+    ``flexure.update_interval_s``; others, which take longer, a hundred times less often, with linear
+    interpolation in between. Parameters as for :func:`make_mirror_surface`.
     """
 
     def __init__(
@@ -211,18 +217,27 @@ class DriftingSurface:
     ) -> None:
         self._influence, self._flexure, self._sub_aperture_m = influence, flexure, sub_aperture_m
         self._x, self._y = x_m, y_m
-        self._number = 0
-        self._surface = self._surface_of_step(0)
+        interval_s = flexure.update_interval_s
+        self._interpolated = not isinstance(influence, InfluenceFunctions) and math.isfinite(interval_s)
+        self._interval_s = flexure.interpolation_interval_s if self._interpolated else interval_s
+        self._steps = {0: self._surface_of_step(0)}
 
     def __call__(self, command: NDArray[np.float64], time_s: float) -> NDArray[np.float32]:
         """Surface ``(n_y, n_x)`` in fractions of full stroke for a command ``(n_act,)`` at a time."""
-        number = math.floor(time_s / self._flexure.update_interval_s)
-        if number != self._number:
-            self._surface, self._number = self._surface_of_step(number), number
-        return self._surface(command)
+        number = math.floor(time_s / self._interval_s)
+        wanted = (number, number + 1) if self._interpolated else (number,)
+        steps = self._steps
+        if not steps.keys() >= set(wanted):
+            steps = self._steps = {step: steps.get(step) or self._surface_of_step(step) for step in wanted}
+        if not self._interpolated:
+            return steps[number](command)
+        share = time_s / self._interval_s - number
+        return steps[number]((1 - share) * command) + steps[number + 1](share * command)
 
     def _surface_of_step(self, number: int) -> SurfaceFunction:
-        """Surface function for the middle of interval ``number``."""
-        interval_s = self._flexure.update_interval_s
-        registration = self._flexure.at(0.0 if math.isinf(interval_s) else (number + 0.5) * interval_s)
+        """Surface function for the middle of interval ``number``; if they are interpolated, for its start."""
+        time_s = 0.0
+        if math.isfinite(self._interval_s):
+            time_s = (number if self._interpolated else number + 0.5) * self._interval_s
+        registration = self._flexure.at(time_s)
         return make_mirror_surface(self._influence, registration, self._sub_aperture_m, self._x, self._y)
