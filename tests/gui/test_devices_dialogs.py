@@ -6,11 +6,11 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from gui_windows import click_pixel
 from PySide6.QtCore import Qt
 from PySide6.QtTest import QTest
 from pytestqt.qtbot import QtBot
 from scripted import ScriptedControl, ScriptedSource
-from test_images import click_pixel
 
 from escape_gui.main_window import MainWindow
 from escape_gui.panels.camera import CameraPanel
