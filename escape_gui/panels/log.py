@@ -11,6 +11,7 @@ from PySide6.QtWidgets import QComboBox, QLineEdit, QPlainTextEdit, QPushButton
 
 from escape_gui.panels.base import Context, Panel
 from escape_gui.widgets.controls import row
+from escape_hw.io.provenance import format_local_time
 from escape_hw.remote.source import DataSource
 from escape_hw.remote.state import LogLine
 
@@ -96,7 +97,7 @@ class LogPanel(Panel):
         colours = self.context.theme.colours
         colour = getattr(colours, _COLOURS.get(line.level, "text"))
         times = f" (× {repeats})" if repeats > 1 else ""
-        moment = escape(line.at_utc.partition("T")[2][:8] or line.at_utc)
+        moment = escape(format_local_time(line.at_utc))
         level = escape(f"{line.level:<8}").replace(" ", "&nbsp;")
         return (
             f'<span style="color:{colours.muted}">{moment}</span> '

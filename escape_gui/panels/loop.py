@@ -124,6 +124,9 @@ class LoopPanel(Panel):
     # ------------------------------------------------------------ data
     def on_state(self, state: State) -> None:
         """Show the current values; a field of the form follows them until it is edited."""
+        if self._loop.closed and not state.loop.closed and self._message_colour == "text":
+            # "Loop closed with ..." is no longer so.
+            self._show_message("")
         self._loop = loop = state.loop
         self.show_placeholder(
             state.phase in (Phase.STARTING, Phase.STOPPED), None if is_measured(state) else NO_SERVER_TEXT

@@ -119,7 +119,7 @@ class NightPanel(Panel):
     def _html(self, entry: NightEntry) -> str:
         colours = self.context.theme.colours
         colour = getattr(colours, _COLOURS.get(entry.kind, "text"))
-        author = f" {entry.author.partition(' ')[0]}:" if entry.kind == "note" and entry.author else ""
+        author = f" {entry.author.partition(' (')[0]}:" if entry.kind == "note" and entry.author else ""
         word = f"<b>{_WORDS[entry.kind]}{escape(author)}</b> " if entry.kind in _WORDS else ""
         text = escape(entry.text.removeprefix("FAULT: ")).replace("\n", "<br>")
         moment = f'<span style="color:{colours.muted}">{entry.time.astimezone():%H:%M:%S}</span>'

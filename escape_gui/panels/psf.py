@@ -52,7 +52,7 @@ class PsfPanel(Panel):
     streams: ClassVar[tuple[str, ...]] = ("psf", "model_psf")
     rate_hz: ClassVar[float] = 10.0
     placeholder: ClassVar[str] = (
-        "No image yet.\nThe science camera, if there is one, is read while the loop is closed."
+        "No image.\nIt is shown when a server has opened the science camera, if there is one."
     )
 
     #: Name of the camera whose settings are to be shown.

@@ -9,7 +9,7 @@ import numpy as np
 import pyqtgraph as pg
 from numpy.typing import NDArray
 from PySide6.QtCore import Qt
-from PySide6.QtGui import QColor
+from PySide6.QtGui import QColor, QFontMetricsF, QResizeEvent
 
 from escape_gui.client.history import TimeSeriesBuffer
 from escape_gui.theme import Theme
@@ -21,6 +21,8 @@ DASHES = (
     Qt.PenStyle.SolidLine, Qt.PenStyle.DashLine, Qt.PenStyle.DotLine, Qt.PenStyle.DashDotLine,
     Qt.PenStyle.DashDotDotLine,
 )  # fmt: skip
+#: Room between two plots above each other.
+_ROW_GAP_PX = 8
 #: Markers by number of the curve: pyqtgraph's name, and the character for it in texts.
 MARKERS = (("o", "●"), ("s", "■"), ("t1", "▲"), ("d", "◆"), ("t", "▼"), ("star", "★"))
 
@@ -111,18 +113,33 @@ class SectionPlot(Plot):
 
 
 class StripChart(Plot):
-    """A quantity over the last ``span_s`` seconds."""
+    """A quantity over the last ``span_s`` seconds; without data, its axis ends at ``empty_top``.
 
-    def __init__(self, theme: Theme, name: str, y: str, span_s: float = 120.0, number: int = 0) -> None:
+    A low chart has the unit only, ``[...]`` at the end of ``y``, as title of its axis.
+    """
+
+    def __init__(
+        self, theme: Theme, name: str, y: str, span_s: float = 120.0, number: int = 0, empty_top: float = 1.0
+    ) -> None:
+        self._title, self._empty_top = y, empty_top
         super().__init__(theme, name, "time before now [s]", y)
         self._line = self.curve(number, alone=True, connect="finite")
         # Room for the upper half of the highest tick label.
         self.getPlotItem().layout.setContentsMargins(1, 8, 1, 1)
         # Hours are more points than pixels.
         self._line.setDownsampling(auto=True, method="peak")
-        self.getPlotItem().enableAutoRange(axis="y")
+        self.setYRange(0, empty_top)
         self.pin_left_axis()
         self.set_span(span_s)
+        self.getPlotItem().getViewBox().sigResized.connect(lambda _: self._fit_title())
+
+    def _fit_title(self) -> None:
+        axis, metrics = self.getAxis("left"), QFontMetricsF(self._theme.font(0.85))
+        fits = metrics.horizontalAdvance(self._title) <= axis.size().height() + _ROW_GAP_PX
+        label = self._title if fits else self._title[self._title.index("[") :]
+        if label != self._labels["left"]:
+            self._labels["left"] = label
+            axis.setLabel(label)
 
     def set_span(self, span_s: float) -> None:
         """Show the last ``span_s`` seconds, in seconds, minutes or hours."""
@@ -134,6 +151,10 @@ class StripChart(Plot):
     def show_history(self, history: TimeSeriesBuffer, now: float) -> None:
         times, values = history.arrays
         first = int(np.searchsorted(times, now - self.span_s))
+        if np.isfinite(values[first:]).any():
+            self.getPlotItem().enableAutoRange(axis="y")
+        else:
+            self.setYRange(0, self._empty_top)
         self._line.setData((times[first:] - now) / self._unit_s, values[first:])
 
 
@@ -370,19 +391,21 @@ class _ParameterGrid(PlotGrid):
         return plot
 
 
-#: Room between two plots of a grid.
-_ROW_GAP_PX = 8
-
-
 def _fit_title(axis: pg.AxisItem) -> None:
     """Hide the title of an axis that is longer than the axis; it would overlap the next one."""
     axis.showLabel(axis.label.boundingRect().width() <= axis.size().height() + _ROW_GAP_PX)
+
+
+#: Least height of plots below each other with a title below the last one.
+_LEAST_TITLED_PX = 180
 
 
 class ConvergencePlot(_ParameterGrid):
     """Step norm; below, all parameters normalised on one axis, or each group in its physical unit."""
 
     def __init__(self, theme: Theme) -> None:
+        # It gets events before it has plots.
+        self._plots: list[pg.PlotItem] = []
         super().__init__(theme)
         self._history: ConvergenceHistory | None = None
         #: Parameters are shown in their physical units; otherwise normalised.
@@ -422,7 +445,17 @@ class ConvergencePlot(_ParameterGrid):
             plot.addItem(mark)
             self.ci.layout.setRowStretchFactor(row, 3 if row or self.physical else 2)
         self._plots = plots
+        self._fit_label()
         self._fill()
+
+    def resizeEvent(self, event: QResizeEvent | None) -> None:
+        super().resizeEvent(event)
+        self._fit_label()
+
+    def _fit_label(self) -> None:
+        """Low plots have no title below, which would take half of their height."""
+        for plot in self._plots[-1:]:
+            plot.getAxis("bottom").showLabel(self.height() >= self._theme.pixels(_LEAST_TITLED_PX))
 
     def _fill(self) -> None:
         history = self._history

@@ -408,17 +408,20 @@ class Connection:
         return Sample(head["index"], head["exposed_ns"], head["arrived_ns"], array, head["meta"])
 
     def geometry(self) -> Geometry:
-        """Positions of the sub-apertures and actuators; requested again when they change."""
+        """Positions of the sub-apertures and actuators; requested again when they change.
+
+        Empty until an engine has started; the last ones while there is none.
+        """
         state = self._state
         key = (state.engine_pid, state.phase is Phase.STARTING, state.geometry_version)
         known = self._geometry
-        if known is None or known[0] != key:
+        if state.engine_pid and (known is None or known[0] != key):
             try:
                 answer, _ = self._request("geometry")
             except EscapeError:
                 return Geometry() if known is None else known[1]
             known = self._geometry = (key, Geometry.model_validate(answer))
-        return known[1]
+        return Geometry() if known is None else known[1]
 
     def log_after(self, number: int) -> Sequence[LogLine]:
         """Log lines with a larger number."""

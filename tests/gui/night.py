@@ -117,7 +117,7 @@ class Night:
         ended = self.run("escape", frames=str(self.frames))
         panel = self.operator.procedure
         assert panel.verdict.text().split(":")[0] in ("Good", "Usable"), panel.verdict.text()
-        assert "Shift X" in panel.numbers.text()
+        assert "Shift x" in panel.numbers.text()
         assert (Path(ended.folder) / "result.json").is_file()
         modes = self.window.panels["modes"]
         self.operator.until(lambda: modes.matrix_selector.currentText() == "ESCAPE", "the matrix is shown")
@@ -190,6 +190,7 @@ class Night:
         self.operator.until(lambda: np.allclose(commands(), flat, atol=1e-6), "the mirror is flat")
         self.operator.until(lambda: self.state.mirror.peak < 1e-6, "the server says so")
         self.operator.until(lambda: "flat again" in mirror.poke_text.text(), "the panel says so")
+        self.events.append(f"poke of actuator {number + 1} at +0.05 of the stroke")
         self.images("poke")
         self.operator.press(mirror.arm_button)
         self.key(Qt.Key.Key_3, Qt.KeyboardModifier.ControlModifier)
@@ -222,7 +223,6 @@ class Night:
         self.events += [
             f"FAULT: {escape(self.state.fault.reason)}",
             "fault cleared",
-            "another engine: process",
         ]
         self.clear_fault()
         self.operator.until(lambda: not self.window.fault_banner.isVisible(), "the fault is gone")

@@ -11,7 +11,7 @@ from escape_hw.io.night_log import NightEntry
 from escape_hw.remote import client
 from escape_hw.remote.address import Endpoint
 from escape_hw.remote.client import Connection
-from escape_hw.remote.state import State
+from escape_hw.remote.state import Geometry, State
 
 
 class FakeServer:
@@ -88,6 +88,13 @@ def test_entries_that_were_published_while_disconnected_are_requested(server: li
     served.publish_state()
     served.beat()
     assert texts(connection) == ["a", "b"]
+
+
+def test_a_server_without_an_engine_is_not_asked_for_its_geometry(server: list[FakeServer]) -> None:
+    connection = connect()
+    (served,) = server
+    assert connection.geometry() == Geometry()
+    assert "geometry" not in served.asked, "the engine has died, or starts"
 
 
 def test_an_entry_after_a_gap_comes_with_those_before_it(server: list[FakeServer]) -> None:

@@ -99,6 +99,7 @@ CLOSED = State(
     phase=Phase.LOOP, engine_pid=5, loop=LoopState(closed=True, matrix="escape-3", gain=0.4, leak=0.01)
 )
 IDLE = State(phase=Phase.IDLE, engine_pid=5, loop=LoopState(matrix="escape-3", gain=0.4, leak=0.01))
+POKE = ActiveRun(id=0, name="poke", arguments={}, stage="actuator 19 at +0.05 of the stroke")
 RUN = ActiveRun(
     id=4, name="docrime", arguments={"frames": 1000, "snr": None, "extra_parameters": "", "sky_time": True}
 )
@@ -114,6 +115,11 @@ RUN = ActiveRun(
             CLOSED,
             CLOSED.model_copy(update={"loop": CLOSED.loop.model_copy(update={"gain": 0.5})}),
             ["loop now on 'escape-3', gain 0.5, leak 0.01, 0 modes dropped"],
+        ),
+        (
+            IDLE,
+            IDLE.model_copy(update={"active_run": POKE}),
+            ["poke of actuator 19 at +0.05 of the stroke"],
         ),
         (
             IDLE,

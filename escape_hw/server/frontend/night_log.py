@@ -127,7 +127,11 @@ def describe_changes(before: State, after: State) -> Iterator[tuple[Kind, str]]:
         yield "event", f"another engine: process {after.engine_pid}"
     yield from _describe_loop(before, after)
     run, last_run = after.active_run, before.active_run
-    if run is not None and (last_run is None or run.id != last_run.id):
+    if run is not None and run.name == "poke":
+        if last_run is None:
+            # The stage of a poke, which is no run, is its description.
+            yield "event", f"poke of {run.stage}"
+    elif run is not None and (last_run is None or run.id != last_run.id):
         words = ", ".join(
             f"{key.replace('_', ' ')} {_argument_text(value)}"
             for key, value in run.arguments.items()
