@@ -234,6 +234,8 @@ class MirrorPanel(Panel):
         if self._plan is None or not self.poke_button.isEnabled():
             return
         request, description = self._poke_request, self._plan.description
+        # The button is disabled while the poke is held, and would pass its focus on to any widget.
+        self.arm_button.setFocus()
         self._armed_until = time.monotonic() + ARMED_S
         self.context.session.ask(
             "poke the mirror", lambda server: server.poke(*request),
