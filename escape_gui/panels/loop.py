@@ -227,6 +227,8 @@ class LoopPanel(Panel):
         """Send the checked changes."""
         if self._checked_edit is not None:
             changed = self._checked_edit.changed(self._loop)
+            # The button is disabled next, and would pass its focus on to Revert.
+            self.check_button.setFocus()
             done = f"Applied: {self._checked_edit.describe_changes(self._loop)}"
             self._ask("change the loop", lambda server: server.set_loop(**changed), done)
 

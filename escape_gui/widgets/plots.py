@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -140,6 +141,7 @@ class StripChart(Plot):
         if label != self._labels["left"]:
             self._labels["left"] = label
             axis.setLabel(label)
+            axis.resizeEvent()
 
     def set_span(self, span_s: float) -> None:
         """Show the last ``span_s`` seconds, in seconds, minutes or hours."""
@@ -156,6 +158,19 @@ class StripChart(Plot):
         else:
             self.setYRange(0, self._empty_top)
         self._line.setData((times[first:] - now) / self._unit_s, values[first:])
+
+
+class SparseAxis(pg.AxisItem):  # type: ignore[misc]
+    """A left axis without more numbers than there is room for."""
+
+    def tickValues(self, low: float, high: float, size: float) -> list[tuple[float, list[float]]]:
+        levels: list[tuple[float, list[float]]] = super().tickValues(low, high, size)
+        if not levels:
+            return levels
+        (spacing, values), *others = levels
+        line = QFontMetricsF(self.style["tickFont"] or self.font()).height()
+        step = max(1, math.ceil(len(values) * line / max(size, line)))
+        return [(spacing, list(values[::step])), *(others if step == 1 else ())]
 
 
 class PlotGrid(pg.GraphicsLayoutWidget):  # type: ignore[misc]
@@ -176,7 +191,7 @@ class PlotGrid(pg.GraphicsLayoutWidget):  # type: ignore[misc]
 
     def add_plot(self, row: int = 0) -> pg.PlotItem:
         """Add a plot without menu and mouse interaction."""
-        plot = self.addPlot(row=row, col=0, enableMenu=False)
+        plot = self.addPlot(row=row, col=0, enableMenu=False, axisItems={"left": SparseAxis("left")})
         reparent_menu(plot)
         plot.hideButtons()
         plot.setMouseEnabled(x=False, y=False)

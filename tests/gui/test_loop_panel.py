@@ -118,6 +118,8 @@ def test_the_result_goes_when_the_loop_is_opened(
     loop.check()
     loop.apply()
     qtbot.waitUntil(lambda: "Applied" in loop.message.text())
+    # A further key reverts nothing.
+    assert loop.window().focusWidget() is loop.check_button
     typist.new_state(closed=False)
     assert loop.message.text() == ""
 
