@@ -9,6 +9,7 @@ import numpy as np
 import pyqtgraph as pg
 from numpy.typing import NDArray
 from PySide6.QtCore import Signal
+from PySide6.QtGui import QResizeEvent
 from PySide6.QtWidgets import QPushButton, QWidget
 
 from escape_gui.client.availability import (
@@ -43,6 +44,8 @@ ACTUATOR, MODE = "actuator", "mode"
 ARMED_S = 120.0
 #: Largest command, fraction of full stroke, of a mirror that is shown as flat.
 _FLAT_LEVEL = 1e-6
+#: Height below which the row above the map gives way to the controls of a poke, pixels at font scale 1.
+_LOW_PX = 280
 _POKE_TIP = "Poke it for the time given; the mirror returns to flat by itself."
 
 
@@ -106,7 +109,11 @@ class MirrorPanel(Panel):
         self.body.setSpacing(4)
         self.offsets_button = flat_button("Offsets…", "Tip, tilt, focus, reference slopes and flat")
         self.offsets_button.clicked.connect(self.offsets_requested)
-        self.body.addLayout(row(self.choice, self.offsets_button, None, self.scale))
+        # A low panel still has room for the controls of a poke.
+        self.image_view.setMinimumHeight(72)
+        self._head = QWidget()
+        self.body.addWidget(self._head)
+        row(self.choice, self.offsets_button, None, self.scale, parent=self._head)
         self.body.addWidget(self.image_view, 1)
         self.arm_button = QPushButton("Arm pokes")
         self._toolbar = ImageToolbar(theme, self.image_view)
@@ -172,6 +179,7 @@ class MirrorPanel(Panel):
         # Room for the map, where actuators are clicked; rms and peak are in the header, too.
         self._numbers.setHidden(armed)
         self._toolbar.setHidden(armed)
+        self._fit_head()
         self.arm_button.setText("Disarm" if armed else "Arm pokes")
         if not armed and self._is_held:
             self.context.session.abort()
@@ -180,6 +188,15 @@ class MirrorPanel(Panel):
             self._values[COMMAND] = np.zeros(self._map.n_act)
             self._update_image()
         self._on_poke_edit()
+
+    def resizeEvent(self, event: QResizeEvent) -> None:
+        super().resizeEvent(event)
+        self._fit_head()
+
+    def _fit_head(self) -> None:
+        """A low panel has no room for the row above the map and the controls of a poke."""
+        low = self.height() < self.context.theme.pixels(_LOW_PX)
+        self._head.setHidden(low and self.arm_button.isChecked())
 
     def _on_pixel_clicked(self, x: int, y: int) -> None:
         if self.arm_button.isChecked() and (number := int(self._map.numbers[y, x])) >= 0:

@@ -10,6 +10,7 @@ import pytest
 from gui_windows import dispose, show_window
 from PySide6.QtCore import QPoint, QRect, Qt
 from PySide6.QtWidgets import QApplication, QScrollArea, QTabBar, QWidget
+from pytestqt.qtbot import QtBot
 from scripted import ScriptedSource
 
 from escape_gui.client.session import Session
@@ -146,14 +147,20 @@ def assert_is_in_its_dock(widget: QWidget, window: MainWindow, panel: str) -> No
     [("operate", "loop", "close_button"), ("align", "mirror", "poke_button")],
 )
 def test_buttons_that_are_held_are_visible_in_the_narrowest_window(
-    workspace: str, panel: str, button: str, show: Show, source: ScriptedSource
+    workspace: str, panel: str, button: str, show: Show, source: ScriptedSource, qtbot: QtBot
 ) -> None:
     source.change(phase=Phase.IDLE, loop=LoopState(matrix="escape", gain=0.425, leak=0.026), active_run=None)
     window = show(Settings(workspace=workspace))
     window.resize(1024, 700)
+    found = window.panels[panel]
     if panel == "mirror":
-        window.panels[panel].arm_button.click()
+        found.arm_button.click()
+        qtbot.waitUntil(lambda: "nm of surface" in found.poke_text.text())
     for _ in range(5):
         window.update_timer.tick(force=True)
         QApplication.processEvents()
+    if panel == "mirror":
+        found.poke_text.setText(f"Mirror flat again after: {found._plan.description}")
+        QApplication.processEvents()
+        assert found.image_view.geometry().bottom() < found.arm_button.geometry().top()
     assert_is_in_its_dock(getattr(window.panels[panel], button), window, panel)
