@@ -32,7 +32,7 @@ pytestmark = [pytest.mark.campaign, pytest.mark.timeout(7200)]
 SEED, KILLS = 19, 30
 VICTIMS = ("window", "front end", "engine")
 #: Steps of ``night.py`` that can be repeated at any moment.
-STEPS = ("align", "calibrate", "gain", "poke", "poke_actuator", "record", "reload", "alarm")
+STEPS = ("align", "calibrate", "gain", "poke", "record", "reload", "alarm")
 #: Frames of a calibration of the night, and seconds between the start of a step and the kill, at most.
 FRAMES, LONGEST_S = 800, 3.0
 #: Longest wait for a window to be ready; it may have to clear a fault and to calibrate.
