@@ -57,9 +57,7 @@ class CameraPanel(Panel):
     streams: ClassVar[tuple[str, ...]] = ("frames", "slopes")
     rate_hz: ClassVar[float] = 30.0
     stale_after_s: ClassVar[float | None] = 1.0
-    placeholder: ClassVar[str] = (
-        "No frames yet.\nThey are shown once a server has opened the sensor's camera."
-    )
+    placeholder: ClassVar[str] = "No frames.\nThey are shown once a server has opened the sensor's camera."
 
     #: Name of the camera whose settings are to be shown.
     settings_requested = Signal(str)

@@ -48,6 +48,8 @@ class LatencyPanel(Panel):
         self._curves = []
         for number, plot in enumerate(self.plots):
             plot.setLogMode(x=False, y=True)
+            # Room for the upper half of the highest tick label.
+            plot.getPlotItem().layout.setContentsMargins(1, 8, 1, 1)
             self._curves.append(plot.curve(number, alone=True, stepMode="center", connect="finite"))
         self.body.addLayout(readout_grid(self.readouts))
         self.body.addLayout(row(*((plot, 1) for plot in self.plots)), 1)

@@ -7,10 +7,11 @@ from html import escape
 from typing import ClassVar
 
 from PySide6.QtGui import QGuiApplication, QTextCursor
-from PySide6.QtWidgets import QComboBox, QLineEdit, QPlainTextEdit, QPushButton
+from PySide6.QtWidgets import QComboBox, QLineEdit, QPushButton
 
 from escape_gui.panels.base import Context, Panel
-from escape_gui.widgets.controls import row
+from escape_gui.widgets.controls import LogText, row
+from escape_hw.io.provenance import format_local_time
 from escape_hw.remote.source import DataSource
 from escape_hw.remote.state import LogLine
 
@@ -43,11 +44,7 @@ class LogPanel(Panel):
         self.level.setAccessibleName("Minimum level")
         self.level.setToolTip("Show lines of this level and above")
         self.level.currentIndexChanged.connect(self._refilter)
-        self.text = QPlainTextEdit()
-        self.text.setReadOnly(True)
-        self.text.setMaximumBlockCount(MAX_LINES)
-        self.text.setAccessibleName("Lines of the log")
-        self.text.setLineWrapMode(QPlainTextEdit.LineWrapMode.WidgetWidth)
+        self.text = LogText("Lines of the log", MAX_LINES)
         self.copy_button = QPushButton("Copy")
         self.copy_button.setToolTip("Copy the lines shown")
         self.copy_button.clicked.connect(lambda: QGuiApplication.clipboard().setText(self.text.toPlainText()))
@@ -56,8 +53,6 @@ class LogPanel(Panel):
         self._lines: deque[LogLine] = deque(maxlen=MAX_LINES)
         self._number = -1
         self._last_shown, self._repeats = ("", ""), 0
-        self._follow_newest = True
-        self.text.verticalScrollBar().actionTriggered.connect(self._on_scroll)
         self.apply_theme()
 
     def tick(self, source: DataSource) -> None:
@@ -66,13 +61,7 @@ class LogPanel(Panel):
             self._number = new[-1].number
             self._lines.extend(new)
             self._append([line for line in new if self._matches(line)])
-        if self._follow_newest:
-            bar = self.text.verticalScrollBar()
-            bar.setValue(bar.maximum())
-
-    def _on_scroll(self) -> None:
-        bar = self.text.verticalScrollBar()
-        self._follow_newest = bar.sliderPosition() >= bar.maximum()
+        self.text.show_newest()
 
     def _matches(self, line: LogLine) -> bool:
         if line.level in LEVELS and LEVELS.index(line.level) < self.level.currentIndex():
@@ -96,7 +85,7 @@ class LogPanel(Panel):
         colours = self.context.theme.colours
         colour = getattr(colours, _COLOURS.get(line.level, "text"))
         times = f" (× {repeats})" if repeats > 1 else ""
-        moment = escape(line.at_utc.partition("T")[2][:8] or line.at_utc)
+        moment = escape(format_local_time(line.at_utc))
         level = escape(f"{line.level:<8}").replace(" ", "&nbsp;")
         return (
             f'<span style="color:{colours.muted}">{moment}</span> '

@@ -124,6 +124,9 @@ class LoopPanel(Panel):
     # ------------------------------------------------------------ data
     def on_state(self, state: State) -> None:
         """Show the current values; a field of the form follows them until it is edited."""
+        if self._loop.closed and not state.loop.closed and self._message_colour == "text":
+            # "Loop closed with ..." is no longer so.
+            self._show_message("")
         self._loop = loop = state.loop
         self.show_placeholder(
             state.phase in (Phase.STARTING, Phase.STOPPED), None if is_measured(state) else NO_SERVER_TEXT
@@ -224,6 +227,8 @@ class LoopPanel(Panel):
         """Send the checked changes."""
         if self._checked_edit is not None:
             changed = self._checked_edit.changed(self._loop)
+            # The button is disabled next, and would pass its focus on to Revert.
+            self.check_button.setFocus()
             done = f"Applied: {self._checked_edit.describe_changes(self._loop)}"
             self._ask("change the loop", lambda server: server.set_loop(**changed), done)
 

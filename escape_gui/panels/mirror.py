@@ -9,6 +9,7 @@ import numpy as np
 import pyqtgraph as pg
 from numpy.typing import NDArray
 from PySide6.QtCore import Signal
+from PySide6.QtGui import QResizeEvent
 from PySide6.QtWidgets import QPushButton, QWidget
 
 from escape_gui.client.availability import (
@@ -41,6 +42,10 @@ COMMAND, MEASURED = "command", "measured"
 ACTUATOR, MODE = "actuator", "mode"
 #: Time without a poke or an edit after which pokes are disarmed, seconds.
 ARMED_S = 120.0
+#: Largest command, fraction of full stroke, of a mirror that is shown as flat.
+_FLAT_LEVEL = 1e-6
+#: Height below which the row above the map gives way to the controls of a poke, pixels at font scale 1.
+_LOW_PX = 280
 _POKE_TIP = "Poke it for the time given; the mirror returns to flat by itself."
 
 
@@ -85,7 +90,12 @@ class MirrorPanel(Panel):
         )
         self.choice.chosen.connect(lambda _: self._update_image())
         self.image_view = ImageViewer(
-            theme, "Map of the actuators", DIVERGING_MAPS, symmetric=True, unit="stroke", min_level=1e-6
+            theme,
+            "Map of the actuators",
+            DIVERGING_MAPS,
+            symmetric=True,
+            unit="stroke",
+            min_level=_FLAT_LEVEL,
         )
         self.scale = caption()
         self.readouts = {
@@ -99,10 +109,16 @@ class MirrorPanel(Panel):
         self.body.setSpacing(4)
         self.offsets_button = flat_button("Offsets…", "Tip, tilt, focus, reference slopes and flat")
         self.offsets_button.clicked.connect(self.offsets_requested)
-        self.body.addLayout(row(self.choice, self.offsets_button, None, self.scale))
+        # A low panel still has room for the controls of a poke.
+        self.image_view.setMinimumHeight(72)
+        self._head = QWidget()
+        self.body.addWidget(self._head)
+        row(self.choice, self.offsets_button, None, self.scale, parent=self._head)
         self.body.addWidget(self.image_view, 1)
         self.arm_button = QPushButton("Arm pokes")
-        self.body.addLayout(row(self.arm_button, (ImageToolbar(theme, self.image_view), 1)))
+        self._toolbar = ImageToolbar(theme, self.image_view)
+        self._poke_target = QWidget()
+        self.body.addLayout(row(self.arm_button, (self._toolbar, 1), (self._poke_target, 1)))
         self._numbers = QWidget()
         self._numbers.setLayout(readout_grid(self.readouts))
         self.body.addWidget(self._numbers)
@@ -140,13 +156,14 @@ class MirrorPanel(Panel):
         self.poke_button = HoldButton("poke", theme)
         self.poke_button.confirmed.connect(self._poke)
         self._poke_row = QWidget()
-        what = row(self.poke_kind, (self.poke_number, 1), spacing=4)
+        row(self.poke_kind, (self.poke_number, 1), parent=self._poke_target, spacing=4)
+        self._poke_target.hide()
         amount = row(
             (self.poke_amplitude, 1), caption("of the stroke, for"), (self.poke_seconds, 1), caption("s"),
             spacing=4,
         )  # fmt: skip
         last = row((self.poke_text, 1), self.poke_button)
-        column(what, amount, last, parent=self._poke_row, spacing=4)
+        column(amount, last, parent=self._poke_row, spacing=4)
         self._poke_row.hide()
         self.body.addWidget(self._poke_row)
         self._spot = pg.ScatterPlotItem(symbol="o", size=16, brush=None)
@@ -158,9 +175,12 @@ class MirrorPanel(Panel):
 
     def _on_armed(self, armed: bool) -> None:
         self._poke_row.setVisible(armed)
+        self._poke_target.setVisible(armed)
         # Room for the map, where actuators are clicked; rms and peak are in the header, too.
         self._numbers.setHidden(armed)
-        self.arm_button.setText("Disarm pokes" if armed else "Arm pokes")
+        self._toolbar.setHidden(armed)
+        self._fit_head()
+        self.arm_button.setText("Disarm" if armed else "Arm pokes")
         if not armed and self._is_held:
             self.context.session.abort()
         # The map of an idle mirror, which has sent no command yet.
@@ -168,6 +188,15 @@ class MirrorPanel(Panel):
             self._values[COMMAND] = np.zeros(self._map.n_act)
             self._update_image()
         self._on_poke_edit()
+
+    def resizeEvent(self, event: QResizeEvent) -> None:
+        super().resizeEvent(event)
+        self._fit_head()
+
+    def _fit_head(self) -> None:
+        """A low panel has no room for the row above the map and the controls of a poke."""
+        low = self.height() < self.context.theme.pixels(_LOW_PX)
+        self._head.setHidden(low and self.arm_button.isChecked())
 
     def _on_pixel_clicked(self, x: int, y: int) -> None:
         if self.arm_button.isChecked() and (number := int(self._map.numbers[y, x])) >= 0:
@@ -222,6 +251,8 @@ class MirrorPanel(Panel):
         if self._plan is None or not self.poke_button.isEnabled():
             return
         request, description = self._poke_request, self._plan.description
+        # The button is disabled while the poke is held, and would pass its focus on to any widget.
+        self.arm_button.setFocus()
         self._armed_until = time.monotonic() + ARMED_S
         self.context.session.ask(
             "poke the mirror", lambda server: server.poke(*request),
@@ -295,7 +326,8 @@ class MirrorPanel(Panel):
         self.image_view.show_array(self._map.to_image(values))
         level, second = self.image_view.levels[1], self.image_view.second_unit
         nm_text = "" if second is None else f" = {second[0] * level:.0f} nm"
-        self.scale.setText(f"±{level:.3g} {self.image_view.unit}{nm_text}")
+        is_flat = not np.any(np.abs(values) > _FLAT_LEVEL)
+        self.scale.setText("flat" if is_flat else f"±{level:.3g} {self.image_view.unit}{nm_text}")
 
     def _update_measured_button(self) -> None:
         button = self.choice.buttons[MEASURED]

@@ -9,11 +9,11 @@ from html import escape
 from pathlib import Path
 from typing import ClassVar
 
-from PySide6.QtWidgets import QComboBox, QFileDialog, QLineEdit, QPlainTextEdit, QPushButton
+from PySide6.QtWidgets import QComboBox, QFileDialog, QLineEdit, QPushButton
 
 from escape_gui.client.session import runs_folder
 from escape_gui.panels.base import Context, Panel
-from escape_gui.widgets.controls import row, set_available, text_label
+from escape_gui.widgets.controls import LogText, row, set_available, text_label
 from escape_hw.io.night_log import MAX_TEXT, NightEntry, night_of
 from escape_hw.remote.source import DataSource
 from escape_hw.remote.state import State
@@ -58,10 +58,7 @@ class NightPanel(Panel):
         self.export_button = QPushButton("Export…")
         self.export_button.setToolTip("Write the log of this night as HTML or Markdown, with figures")
         self.export_button.clicked.connect(self._ask_export)
-        self.text = QPlainTextEdit()
-        self.text.setReadOnly(True)
-        self.text.setMaximumBlockCount(MAX_ENTRIES)
-        self.text.setAccessibleName("Entries of the night log")
+        self.text = LogText("Entries of the night log", MAX_ENTRIES)
         self.message = text_label()
         self.message.hide()
         self.body.addLayout(row((self.note, 1), self.add_button))
@@ -105,21 +102,18 @@ class NightPanel(Panel):
             entries = [entry for entry in new if entry.kind != "sample"]
             self._entries.extend(entries)
             self._append(entries)
+        self.text.show_newest()
 
     def _append(self, entries: Sequence[NightEntry]) -> None:
-        bar = self.text.verticalScrollBar()
-        at_end = bar.value() >= bar.maximum()
         kinds = FILTERS[self.filter.currentText()]
         for entry in entries:
             if entry.kind in kinds:
                 self.text.appendHtml(self._html(entry))
-        if at_end:
-            bar.setValue(bar.maximum())
 
     def _html(self, entry: NightEntry) -> str:
         colours = self.context.theme.colours
         colour = getattr(colours, _COLOURS.get(entry.kind, "text"))
-        author = f" {entry.author.partition(' ')[0]}:" if entry.kind == "note" and entry.author else ""
+        author = f" {entry.author.partition(' (')[0]}:" if entry.kind == "note" and entry.author else ""
         word = f"<b>{_WORDS[entry.kind]}{escape(author)}</b> " if entry.kind in _WORDS else ""
         text = escape(entry.text.removeprefix("FAULT: ")).replace("\n", "<br>")
         moment = f'<span style="color:{colours.muted}">{entry.time.astimezone():%H:%M:%S}</span>'

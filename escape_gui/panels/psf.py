@@ -30,8 +30,6 @@ _TIPS = (
 )
 #: Period of the measurement of width and encircled energy, which takes about 20 ms.
 _SHAPE_PERIOD_S = 1.0
-#: Width of the panel from which the whole text is shown, pixels.
-_WIDE = 400
 CAPTIONS = {"psf": "PSF: measured (—)", "model_psf": "PSF: reference (- -)"}
 #: Caption and tooltip if there is no reference.
 NO_REFERENCE = "no reference PSF"
@@ -52,7 +50,7 @@ class PsfPanel(Panel):
     streams: ClassVar[tuple[str, ...]] = ("psf", "model_psf")
     rate_hz: ClassVar[float] = 10.0
     placeholder: ClassVar[str] = (
-        "No image yet.\nThe science camera, if there is one, is read while the loop is closed."
+        "No image.\nIt is shown when a server has opened the science camera, if there is one."
     )
 
     #: Name of the camera whose settings are to be shown.
@@ -158,8 +156,10 @@ class PsfPanel(Panel):
             self.shape_text.setText(f"no width: {error}")
             return
         text = format_shape(self.shape, self.bench_geometry.psf_px)
-        wide = self.width() >= self.context.theme.pixels(_WIDE)
-        self.shape_text.setText(text if wide else format_widths(self.shape))
+        metrics, margins = self.shape_text.fontMetrics(), self.body.contentsMargins()
+        room = self.width() - margins.left() - margins.right()
+        fits = max(map(metrics.horizontalAdvance, text.splitlines())) <= room
+        self.shape_text.setText(text if fits else format_widths(self.shape))
         self.shape_text.setToolTip(text)
         if self.choice.selected != ENERGY:
             return

@@ -74,12 +74,14 @@ class SprintPanel(Panel):
         self.units.toggled.connect(self.plot.set_physical_units)
         self.tabs.setCornerWidget(self.units)
         table = QGridLayout()
-        table.setHorizontalSpacing(6)
+        table.setHorizontalSpacing(5)
         table.setVerticalSpacing(0)
         self._markers = [QLabel(MARKERS[k][1]) for k in range(len(PARAMETERS))]
         self._values = [QLabel("–") for _ in PARAMETERS]
+        self._words: list[QLabel] = []
         for k, (marker, value) in enumerate(zip(self._markers, self._values, strict=True)):
-            for at, widget in enumerate((marker, QLabel(NAMES[k]), value, QLabel(short_unit(UNITS[k])))):
+            self._words += [QLabel(NAMES[k]), QLabel(short_unit(UNITS[k]))]
+            for at, widget in enumerate((marker, self._words[-2], value, self._words[-1])):
                 table.addWidget(widget, k, at)
         table.setColumnStretch(3, 1)
         self._notes = text_label()
@@ -165,7 +167,10 @@ class SprintPanel(Panel):
         theme = self.context.theme
         for k, (marker, value) in enumerate(zip(self._markers, self._values, strict=True)):
             marker.setStyleSheet(f"color: {theme.series(k).name()};")
-            value.setFont(theme.font(mono=True))
+            value.setFont(theme.font(0.92, mono=True))
+        # Five rows with their units fit the narrowest column.
+        for label in self._words:
+            label.setFont(theme.font(0.92))
 
     def export_arrays(self) -> tuple[ExportArray, ...]:
         """Parameters by iteration, and the track, in the paper's units."""

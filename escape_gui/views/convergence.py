@@ -115,11 +115,12 @@ def _time_unit(seconds: float) -> tuple[str, float]:
 
 
 def short_unit(unit: str) -> str:
-    """Abbreviation of a unit for axes and narrow columns."""
+    """A unit as axes, fields and narrow columns show it."""
     return _SHORT.get(unit.lower(), unit)
 
 
 _SHORT = {
+    "frame": "frames",
     "% of a sub-aperture": "% sub-ap.", "% of sub aperture": "% sub-ap.",
     "% of the diameter": "% diam.", "% of diameter": "% diam.",
 }  # fmt: skip

@@ -108,7 +108,7 @@ def format_duration(seconds: float) -> str:
 def plan_lines(plan: ProcedurePlan, *, simulated: bool = False) -> list[str]:
     """A plan in two lines: what it takes, and how far the mirror moves."""
     rate = "simulated frame rate of the camera" if simulated else "camera's frame rate"
-    stroke = f"poke amplitude up to {100 * plan.stroke:.3g} % of stroke" if plan.stroke else "no pokes"
+    stroke = f"largest command about {100 * plan.stroke:.2g} % of stroke" if plan.stroke else "no pokes"
     if not plan.frames:
         return ["no frames needed: computed from existing data", ""]
     return [f"{plan.frames} frames, {format_duration(plan.seconds)} at the {rate}", stroke]
@@ -191,7 +191,7 @@ def _frames_line(now: Mapping[str, Any]) -> str:
     seconds, lost = now.get("sky_seconds"), now.get("lost_frames")
     if not isinstance(seconds, int | float) and now.get("rate_hz"):
         seconds = now["frames"] / now["rate_hz"]
-    parts = [f"Frames: {now['frames']:,}"]
+    parts = [f"Frames: {now['frames']}"]
     if isinstance(seconds, int | float):
         parts.append(f"{format_duration(seconds)}{' (simulated)' if now.get('simulated') else ''}")
     if isinstance(lost, int | float):
@@ -207,6 +207,7 @@ def _registration_lines(now: Mapping[str, Any], before: Mapping[str, Any] | None
         if not one or one.get("value") is None:
             continue
         title, unit = TITLES[name]
+        title = title.capitalize()
         value = format_with_error(Estimate(one["value"], one.get("sigma") or 0.0))
         line = f"{title}: {value} {short_unit(unit)}"
         last = old.get(name)

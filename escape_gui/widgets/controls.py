@@ -16,6 +16,7 @@ from PySide6.QtWidgets import (
     QHBoxLayout,
     QLabel,
     QLayout,
+    QPlainTextEdit,
     QPushButton,
     QScrollArea,
     QSizePolicy,
@@ -132,6 +133,28 @@ class SegmentedButton(QWidget):
 
     def choose(self, text: str) -> None:
         self.buttons[text].click()
+
+
+class LogText(QPlainTextEdit):
+    """Lines of a log. It follows the newest one until the operator scrolls up."""
+
+    def __init__(self, name: str, max_lines: int) -> None:
+        super().__init__()
+        self.setReadOnly(True)
+        self.setMaximumBlockCount(max_lines)
+        self.setAccessibleName(name)
+        self._follows_newest = True
+        self.verticalScrollBar().actionTriggered.connect(self._on_scroll)
+
+    def _on_scroll(self) -> None:
+        bar = self.verticalScrollBar()
+        self._follows_newest = bar.sliderPosition() >= bar.maximum()
+
+    def show_newest(self) -> None:
+        """Scroll to the end; called often, because lines wrap anew when the panel is resized."""
+        if self._follows_newest:
+            bar = self.verticalScrollBar()
+            bar.setValue(bar.maximum())
 
 
 class HoldButton(QPushButton):

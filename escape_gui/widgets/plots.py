@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -9,7 +10,7 @@ import numpy as np
 import pyqtgraph as pg
 from numpy.typing import NDArray
 from PySide6.QtCore import Qt
-from PySide6.QtGui import QColor
+from PySide6.QtGui import QColor, QFontMetricsF, QResizeEvent
 
 from escape_gui.client.history import TimeSeriesBuffer
 from escape_gui.theme import Theme
@@ -21,6 +22,8 @@ DASHES = (
     Qt.PenStyle.SolidLine, Qt.PenStyle.DashLine, Qt.PenStyle.DotLine, Qt.PenStyle.DashDotLine,
     Qt.PenStyle.DashDotDotLine,
 )  # fmt: skip
+#: Room between two plots above each other.
+_ROW_GAP_PX = 8
 #: Markers by number of the curve: pyqtgraph's name, and the character for it in texts.
 MARKERS = (("o", "●"), ("s", "■"), ("t1", "▲"), ("d", "◆"), ("t", "▼"), ("star", "★"))
 
@@ -111,18 +114,32 @@ class SectionPlot(Plot):
 
 
 class StripChart(Plot):
-    """A quantity over the last ``span_s`` seconds."""
+    """A quantity over the last seconds, see :meth:`set_span`; without data, its axis ends at ``empty_top``.
 
-    def __init__(self, theme: Theme, name: str, y: str, number: int = 0) -> None:
+    A low chart has the unit only, ``[...]`` at the end of ``y``, as title of its axis.
+    """
+
+    def __init__(self, theme: Theme, name: str, y: str, number: int = 0, empty_top: float = 1.0) -> None:
+        self._title, self._empty_top = y, empty_top
         super().__init__(theme, name, "time before now [s]", y)
         self._line = self.curve(number, alone=True, connect="finite")
         # Room for the upper half of the highest tick label.
         self.getPlotItem().layout.setContentsMargins(1, 8, 1, 1)
         # Hours are more points than pixels.
         self._line.setDownsampling(auto=True, method="peak")
-        self.getPlotItem().enableAutoRange(axis="y")
+        self.setYRange(0, empty_top)
         self.pin_left_axis()
         self.set_span(120.0)
+        self.getPlotItem().getViewBox().sigResized.connect(lambda _: self._fit_title())
+
+    def _fit_title(self) -> None:
+        axis, metrics = self.getAxis("left"), QFontMetricsF(self._theme.font(0.85))
+        fits = metrics.horizontalAdvance(self._title) <= axis.size().height() + _ROW_GAP_PX
+        label = self._title if fits else self._title[self._title.index("[") :]
+        if label != self._labels["left"]:
+            self._labels["left"] = label
+            axis.setLabel(label)
+            axis.resizeEvent()
 
     def set_span(self, span_s: float) -> None:
         """Show the last ``span_s`` seconds, in seconds, minutes or hours."""
@@ -134,7 +151,24 @@ class StripChart(Plot):
     def show_history(self, history: TimeSeriesBuffer, now: float) -> None:
         times, values = history.arrays
         first = int(np.searchsorted(times, now - self.span_s))
+        if np.isfinite(values[first:]).any():
+            self.getPlotItem().enableAutoRange(axis="y")
+        else:
+            self.setYRange(0, self._empty_top)
         self._line.setData((times[first:] - now) / self._unit_s, values[first:])
+
+
+class SparseAxis(pg.AxisItem):  # type: ignore[misc]
+    """A left axis without more numbers than there is room for."""
+
+    def tickValues(self, low: float, high: float, size: float) -> list[tuple[float, list[float]]]:
+        levels: list[tuple[float, list[float]]] = super().tickValues(low, high, size)
+        if not levels:
+            return levels
+        (spacing, values), *others = levels
+        line = QFontMetricsF(self.style["tickFont"] or self.font()).height()
+        step = max(1, math.ceil(len(values) * line / max(size, line)))
+        return [(spacing, list(values[::step])), *(others if step == 1 else ())]
 
 
 class PlotGrid(pg.GraphicsLayoutWidget):  # type: ignore[misc]
@@ -155,7 +189,7 @@ class PlotGrid(pg.GraphicsLayoutWidget):  # type: ignore[misc]
 
     def add_plot(self, row: int = 0) -> pg.PlotItem:
         """Add a plot without menu and mouse interaction."""
-        plot = self.addPlot(row=row, col=0, enableMenu=False)
+        plot = self.addPlot(row=row, col=0, enableMenu=False, axisItems={"left": SparseAxis("left")})
         reparent_menu(plot)
         plot.hideButtons()
         plot.setMouseEnabled(x=False, y=False)
@@ -370,19 +404,21 @@ class _ParameterGrid(PlotGrid):
         return plot
 
 
-#: Room between two plots of a grid.
-_ROW_GAP_PX = 8
-
-
 def _fit_title(axis: pg.AxisItem) -> None:
     """Hide the title of an axis that is longer than the axis; it would overlap the next one."""
     axis.showLabel(axis.label.boundingRect().width() <= axis.size().height() + _ROW_GAP_PX)
+
+
+#: Least height of plots below each other with a title below the last one.
+_LEAST_TITLED_PX = 180
 
 
 class ConvergencePlot(_ParameterGrid):
     """Step norm; below, all parameters normalised on one axis, or each group in its physical unit."""
 
     def __init__(self, theme: Theme) -> None:
+        # It gets events before it has plots.
+        self._plots: list[pg.PlotItem] = []
         super().__init__(theme)
         self._history: ConvergenceHistory | None = None
         #: Parameters are shown in their physical units; otherwise normalised.
@@ -422,7 +458,17 @@ class ConvergencePlot(_ParameterGrid):
             plot.addItem(mark)
             self.ci.layout.setRowStretchFactor(row, 3 if row or self.physical else 2)
         self._plots = plots
+        self._fit_label()
         self._fill()
+
+    def resizeEvent(self, event: QResizeEvent | None) -> None:
+        super().resizeEvent(event)
+        self._fit_label()
+
+    def _fit_label(self) -> None:
+        """Low plots have no title below, which would take half of their height."""
+        for plot in self._plots[-1:]:
+            plot.getAxis("bottom").showLabel(self.height() >= self._theme.pixels(_LEAST_TITLED_PX))
 
     def _fill(self) -> None:
         history = self._history

@@ -35,9 +35,17 @@ class _CurveGrid(PlotGrid):
         super().build()
         self.curves: dict[str, pg.PlotDataItem] = {}
         self._labels: dict[int, pg.LabelItem] = {}
+        self._axes: list[pg.AxisItem] = []
         self.add_curves()
         for name, (x, y) in self._data.items():
             self.curves[name].setData(x, y)
+        self._show_tick_labels()
+
+    def _show_tick_labels(self) -> None:
+        """Numbers at the axes, which mean nothing without data."""
+        has_data = any(np.isfinite(y).any() for _, y in self._data.values())
+        for axis in self._axes:
+            axis.setStyle(showValues=has_data)
 
     def add_curves(self) -> None:
         """Add the plots and their curves; for the subclass."""
@@ -46,6 +54,7 @@ class _CurveGrid(PlotGrid):
         """Add a plot below a line of text, see :meth:`_set_label`, because labels along low axes overlap."""
         self._labels[number] = self.addLabel("", row=2 * number, col=0, justify="left")
         plot = self.add_plot(2 * number + 1)
+        self._axes += [plot.getAxis("left"), *([plot.getAxis("bottom")] if bottom else ())]
         plot.setLogMode(*log)
         style_axis(self._theme, plot.getAxis("left"), "")
         plot.getAxis("left").showLabel(False)
@@ -81,6 +90,7 @@ class _CurveGrid(PlotGrid):
             values = np.where(values > floor, values, np.nan)
         self._data[name] = (x[: values.size], values)
         self.curves[name].setData(*self._data[name])
+        self._show_tick_labels()
 
 
 class ResidualPlot(_CurveGrid):

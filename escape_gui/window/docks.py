@@ -165,7 +165,8 @@ WORKSPACES: tuple[Workspace, ...] = (
         "Operate",
         "Closed loop, Strehl, latency",
         (
-            Column((Cell(("loop",), 1.2), Cell(("devices", "procedure"), 1.0)), 0.9),
+            # The button that closes the loop is visible on a small screen.
+            Column((Cell(("loop",), 1.6), Cell(("devices", "procedure"), 1.0)), 0.9),
             Column(
                 (Cell(("performance", "trends", "telemetry"), 1.4), Cell(("night", "log", "latency"), 0.9)),
                 1.5,

@@ -12,6 +12,7 @@ from PySide6.QtWidgets import QApplication, QHBoxLayout, QLabel, QPushButton, QS
 from escape_gui.client.availability import UNKNOWN_VALUE, has_engine, has_frames, is_measured
 from escape_gui.panels.base import Context
 from escape_gui.widgets.controls import HoldButton, Level, Readout, StatusIndicator, column, row, text_label
+from escape_hw.io.provenance import format_local_time
 from escape_hw.remote.state import Phase, State
 
 PHASES: dict[Phase, Level] = {
@@ -305,5 +306,5 @@ class FaultBanner(Banner):
         if fault is None:
             self.show_text("")
             return
-        text = f"{fault.reason} · {fault.at_utc}"
+        text = f"{format_local_time(fault.at_utc)} {fault.reason}"
         self.show_text(f"{text}\n{fault.remedy}" if fault.remedy else text)

@@ -122,9 +122,12 @@ class NightLogWriter:
 
     def __init__(self, runs: Path, system: str, simulated: bool) -> None:
         self._runs, self._system, self._simulated = runs, system, simulated
-        path = night_path(runs, system, night_of(datetime.now(UTC)))
-        self.earlier = read_night(path) if path.is_file() else []
-        self._next = max((entry.number for entry in self.earlier), default=-1) + 1
+        newest = next(iter(find_nights(runs, system)), None)
+        entries = [] if newest is None else read_night(newest)
+        tonight = newest == night_path(runs, system, night_of(datetime.now(UTC)))
+        self.earlier = entries if tonight else []
+        # Numbers go on from night to night: clients request what comes after the last one that they have.
+        self._next = max((entry.number for entry in entries), default=-1) + 1
         self._appended, self._failed = False, False
 
     def add(

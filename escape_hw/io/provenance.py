@@ -48,6 +48,15 @@ def format_utc(moment: datetime | None = None) -> str:
     return moment.replace(tzinfo=None).isoformat(timespec="milliseconds")
 
 
+def format_local_time(at_utc: str) -> str:
+    """Local time of day of a time as FITS writes it; a text in another format as it is."""
+    try:
+        moment = datetime.strptime(at_utc.partition(".")[0], "%Y-%m-%dT%H:%M:%S")
+    except ValueError:
+        return at_utc
+    return f"{moment.replace(tzinfo=UTC).astimezone():%H:%M:%S}"
+
+
 def file_sha256(path: Path) -> str:
     """SHA-256 of a file in hexadecimal."""
     with path.open("rb") as stream:

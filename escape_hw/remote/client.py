@@ -108,12 +108,14 @@ class Connection(DeviceRequests):
         self._state = State()
         self._log: deque[LogLine] = deque(maxlen=_LINES)
         self._night: deque[NightEntry] = deque(maxlen=_NIGHT_ENTRIES)
+        #: Number of the newest entry of the night log that the server is known to have.
+        self._newest_night = -1
         self._ended: dict[int, FinishedRun] = {}
         self._geometry: tuple[object, Geometry] | None = None
         self._procedures: tuple[ProcedureEntry, ...] | None = None
         self._readers = ReaderCache()
         self._is_local = endpoint.requests.startswith("ipc://")
-        self._link = ClientTransport(endpoint, self._event, self._heartbeat, keys=keys)
+        self._link = ClientTransport(endpoint, self._event, self._heartbeat, self._on_heartbeat_answer, keys)
         try:
             self._register()
         except ServerFull as error:
@@ -138,12 +140,18 @@ class Connection(DeviceRequests):
 
     def _read_night_log(self) -> None:
         """Read the entries of the night log that this client does not have."""
-        new, last = [], self._night[-1].number if self._night else -1
-        while answer := self._request("night_log", after=last)[0]:
-            new += [NightEntry.model_validate(entry) for entry in answer]
-            last = new[-1].number
+        while answer := self._request("night_log", after=self._last_night)[0]:
+            self._add_night_entries(answer)
+
+    @property
+    def _last_night(self) -> int:
+        """Number of the last entry of the night log up to which none is missing."""
+        return self._night[-1].number if self._night else -1
+
+    def _add_night_entries(self, documents: Sequence[Mapping[str, Any]]) -> None:
         with self._changed:
-            known = {entry.number: entry for entry in (*self._night, *new)}
+            known = {entry.number: entry for entry in self._night}
+            known |= {one["number"]: NightEntry.model_validate(one) for one in documents}
             self._night = deque((known[number] for number in sorted(known)), maxlen=_NIGHT_ENTRIES)
 
     def _registration(self) -> Mapping[str, Any]:
@@ -191,7 +199,18 @@ class Connection(DeviceRequests):
         if not self._registered:
             return None
         # A client that was suspended for long is no longer registered.
-        return self._registration() if refused else {"verb": "heartbeat", "client": self.client}
+        if refused:
+            return self._registration()
+        # What was published while this client was disconnected, or too slow.
+        if self._newest_night > (last := self._last_night):
+            return {"verb": "night_log", "client": self.client, "after": last}
+        return {"verb": "heartbeat", "client": self.client}
+
+    def _on_heartbeat_answer(self, answer: Any) -> None:
+        if isinstance(answer, list):
+            self._add_night_entries(answer)
+        elif isinstance(answer, dict) and not self._closed:
+            self._registered, self._waits_for_place = True, False
 
     def _request(self, verb: str, timeout_s: float = TIMEOUT_S, **fields: Any) -> tuple[Any, bytes]:
         """Send a request; returns its answer and bytes (ConfigError: a field is out of range)."""
@@ -212,13 +231,16 @@ class Connection(DeviceRequests):
         with self._changed:
             if topic == "state":
                 self._state = State.model_validate(document)
+                self._newest_night = max(self._newest_night, self._state.last_night_entry)
             elif topic == "log":
                 line = LogLine.model_validate(document)
                 if not self._log or line.number > self._log[-1].number:
                     self._log.append(line)
             elif topic == "night":
                 entry = NightEntry.model_validate(document)
-                if not self._night or entry.number > self._night[-1].number:
+                self._newest_night = max(self._newest_night, entry.number)
+                # After a gap, the next heartbeat requests this entry with those before it.
+                if entry.number == self._last_night + 1:
                     self._night.append(entry)
             elif topic == "progress":
                 running = ActiveRun.model_validate(document)
@@ -265,17 +287,20 @@ class Connection(DeviceRequests):
         return Sample(head["index"], head["exposed_ns"], head["arrived_ns"], array, head["meta"])
 
     def geometry(self) -> Geometry:
-        """Positions of the sub-apertures and actuators; requested again when they change."""
+        """Positions of the sub-apertures and actuators; requested again when they change.
+
+        Empty until an engine has started; the last ones while there is none.
+        """
         state = self._state
         key = (state.engine_pid, state.phase is Phase.STARTING, state.geometry_version)
         known = self._geometry
-        if known is None or known[0] != key:
+        if state.engine_pid and (known is None or known[0] != key):
             try:
                 answer, _ = self._request("geometry")
             except EscapeError:
                 return Geometry() if known is None else known[1]
             known = self._geometry = (key, Geometry.model_validate(answer))
-        return known[1]
+        return Geometry() if known is None else known[1]
 
     def log_after(self, number: int) -> Sequence[LogLine]:
         """Log lines with a larger number."""

@@ -49,6 +49,8 @@ class ClientTransport:
     heartbeat
         Returns the message to send twice a second, or ``None``. Its argument is whether the
         server refused the last one.
+    on_heartbeat_answer
+        Called with the answer to a heartbeat, in the thread of the sockets.
     keys
         The server's public key, this client's public and secret key; ``None`` on the same computer.
     """
@@ -58,9 +60,11 @@ class ClientTransport:
         endpoint: Endpoint,
         on_event: Callable[[str, dict[str, Any]], object],
         heartbeat: Callable[[bool], Mapping[str, Any] | None],
+        on_heartbeat_answer: Callable[[Any], object],
         keys: Keys | None = None,
     ) -> None:
         self._on_event, self._heartbeat = on_event, heartbeat
+        self._on_heartbeat_answer = on_heartbeat_answer
         self._context = zmq.Context()
         self._requests = self._socket(zmq.DEALER, endpoint.requests, keys)
         self._events = self._socket(zmq.SUB, endpoint.events, keys)
@@ -178,13 +182,15 @@ class ClientTransport:
             reply = json.loads(parts[1])
             if answer is None:
                 self._heartbeat_refused = not reply["ok"]
+                if reply["ok"]:
+                    self._on_heartbeat_answer(reply["answer"])
                 return
             if reply["ok"]:
                 data = parts[2] if len(parts) > 2 else b""
                 answer.set_result((reply["answer"], data, int(reply.get("serial", 0))))
             else:
                 answer.set_exception(error_from_document(reply["error"]))
-        except (IndexError, KeyError, ValueError) as error:
+        except (IndexError, KeyError, TypeError, ValueError) as error:
             invalid_reply = ServerGone(f"malformed reply of the server: {error!r}")
             if answer is None:
                 log.warning("%s", invalid_reply)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Self
@@ -88,7 +89,7 @@ class NightReport:
             label, unit = QUANTITIES[name]
             scale = 100.0 if name == "r0_m" else 1.0
             unit = "cm" if name == "r0_m" else unit
-            rows[label] = f"{scale * median:.3g} ({scale * low:.3g} to {scale * high:.3g}) {unit}".rstrip()
+            rows[label] = f"{_format_range(scale * median, scale * low, scale * high)} {unit}".rstrip()
         return rows
 
     def figures(self) -> dict[str, Figure]:
@@ -148,6 +149,15 @@ class NightReport:
         links = {name: path.name.replace(" ", "%20") for name, path in images.items()}
         write_atomic(target, self.to_markdown(links).encode())
         return (target, *images.values())
+
+
+def _format_range(median: float, low: float, high: float) -> str:
+    """A median, and the range of the values with two digits of its half width if they differ."""
+    half = (high - low) / 2
+    if half <= 1e-9 * abs(median):
+        return f"{median:.4g}"
+    digits = min(6, max(0, 1 - math.floor(math.log10(half))))
+    return f"{median:.{digits}f} ({low:.{digits}f} to {high:.{digits}f})"
 
 
 def describe_entry(entry: NightEntry) -> str:

@@ -6,8 +6,9 @@ import gc
 from collections.abc import Sequence
 from pathlib import Path
 
-from PySide6.QtCore import QCoreApplication, QEvent
-from PySide6.QtWidgets import QCheckBox, QComboBox, QLineEdit
+from PySide6.QtCore import QCoreApplication, QEvent, QPoint, Qt
+from PySide6.QtTest import QTest
+from PySide6.QtWidgets import QApplication, QCheckBox, QComboBox, QLineEdit
 
 from escape_gui.client.session import Session
 from escape_gui.main_window import MainWindow
@@ -15,6 +16,7 @@ from escape_gui.panels import PANELS
 from escape_gui.panels.base import Panel
 from escape_gui.settings import Settings
 from escape_gui.widgets.argument_form import ArgumentForm
+from escape_gui.widgets.images import ImageViewer
 
 
 def settle() -> None:
@@ -56,3 +58,11 @@ def enter_argument(form: ArgumentForm, name: str, text: str) -> None:
         field.setCurrentText(text)
     elif isinstance(field, QCheckBox):
         field.setChecked(text == "True")
+
+
+def click_pixel(view: ImageViewer, x: int, y: int, *, twice: bool = False) -> None:
+    """Click the middle of a pixel."""
+    place = view.view.mapFromScene(view.image.mapToScene(x + 0.5, y + 0.5))
+    press = QTest.mouseDClick if twice else QTest.mouseClick
+    press(view.view.viewport(), Qt.MouseButton.LeftButton, pos=QPoint(place.x(), place.y()))
+    QApplication.processEvents()

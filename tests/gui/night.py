@@ -18,9 +18,12 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from datetime import UTC, date, datetime, timedelta
+from html import escape
 from pathlib import Path
 
+import numpy as np
 import serving
+from gui_windows import click_pixel
 from PySide6.QtCore import QPoint, QRect, Qt
 from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QApplication, QDialogButtonBox, QPushButton, QWidget
@@ -28,8 +31,9 @@ from whole_run import Operator, operating, operator_window
 
 from escape_gui.app import qt_application
 from escape_gui.main_window import MainWindow
-from escape_gui.panels.log import LogPanel
 from escape_gui.panels.loop import LoopPanel
+from escape_gui.panels.mirror import COMMAND, MirrorPanel
+from escape_gui.panels.night import NightPanel
 from escape_gui.widgets.controls import HOLD_MS
 from escape_gui.widgets.inputs import NumberBox
 from escape_hw.io.run_folder import find_runs, read_result
@@ -56,10 +60,13 @@ class Night:
     def __init__(self, operator: Operator, folder: Path | None = None, frames: int = 2000) -> None:
         self.operator, self.folder, self.frames = operator, folder, frames
         self.window = operator.window
-        loop, log = self.window.panels["loop"], self.window.panels["log"]
+        loop, mirror, log = (self.window.panels[name] for name in ("loop", "mirror", "night"))
         assert isinstance(loop, LoopPanel)
-        assert isinstance(log, LogPanel)
-        self.loop, self.log = loop, log
+        assert isinstance(mirror, MirrorPanel)
+        assert isinstance(log, NightPanel)
+        self.loop, self.mirror, self.log = loop, mirror, log
+        #: What the log of the night must contain, in HTML.
+        self.events = ["server started"]
 
     @property
     def state(self):
@@ -110,7 +117,7 @@ class Night:
         ended = self.run("escape", frames=str(self.frames))
         panel = self.operator.procedure
         assert panel.verdict.text().split(":")[0] in ("Good", "Usable"), panel.verdict.text()
-        assert "Shift X" in panel.numbers.text()
+        assert "Shift x" in panel.numbers.text()
         assert (Path(ended.folder) / "result.json").is_file()
         modes = self.window.panels["modes"]
         self.operator.until(lambda: modes.matrix_selector.currentText() == "ESCAPE", "the matrix is shown")
@@ -150,6 +157,44 @@ class Night:
         self.operator.until(lambda: self.state.loop.closed, "the loop is closed again")
         assert self.state.loop.matrix == matrix
 
+    def poke_actuator(self) -> None:
+        """Click an actuator in the map and poke it with the button; then the mirror is flat again."""
+        if self.state.loop.closed:
+            self.open()
+        self.key(Qt.Key.Key_1, Qt.KeyboardModifier.ControlModifier)
+        mirror, source = self.mirror, self.window.context.session.source
+        self.operator.until(mirror.arm_button.isEnabled, mirror.arm_button.toolTip())
+        self.operator.press(mirror.arm_button)
+        self.operator.until(lambda: mirror.image_view.data is not None, "the map is shown")
+        self.operator.settle(0.3)
+        numbers = mirror._map.numbers
+        y, x = (int(size) // 2 for size in numbers.shape)
+        click_pixel(mirror.image_view, x, y)
+        number = int(numbers[y, x])
+        assert mirror.poke_number.value() == number + 1
+        assert mirror.poke_kind.selected == "actuator"
+        self.operator.until(
+            lambda: f"actuator {number + 1} at +0.05" in mirror.poke_text.text(), mirror.poke_text.text()
+        )
+        flat = np.zeros(int(numbers.max()) + 1)
+        poked = np.where(np.arange(flat.size) == number, mirror.poke_amplitude.value(), flat)
+
+        def commands() -> np.ndarray:
+            sample = source.latest("commands")
+            return np.full(1, np.nan) if sample is None else sample.data
+
+        self.hold(mirror.poke_button)
+        self.operator.until(lambda: np.allclose(commands(), poked, atol=1e-6), "the actuator is poked")
+        self.operator.until(lambda: np.allclose(mirror._values[COMMAND], poked, atol=1e-6), "it is shown")
+        self.operator.until(lambda: self.state.active_run is None, "the poke ends by itself")
+        self.operator.until(lambda: np.allclose(commands(), flat, atol=1e-6), "the mirror is flat")
+        self.operator.until(lambda: self.state.mirror.peak < 1e-6, "the server says so")
+        self.operator.until(lambda: "flat again" in mirror.poke_text.text(), "the panel says so")
+        self.events.append(f"poke of actuator {number + 1} at +0.05 of the stroke")
+        self.images("poke")
+        self.operator.press(mirror.arm_button)
+        self.key(Qt.Key.Key_3, Qt.KeyboardModifier.ControlModifier)
+
     def record(self) -> None:
         """Record telemetry; the number of frames grows in the last line."""
         self.ensure_closed()
@@ -175,6 +220,10 @@ class Night:
         assert self.loop.close_button.toolTip()
         assert self.window.context.session.history.residual.arrays[0].size >= times, "the history stays"
         self.images("crash")
+        self.events += [
+            f"FAULT: {escape(self.state.fault.reason)}",
+            "fault cleared",
+        ]
         self.clear_fault()
         self.operator.until(lambda: not self.window.fault_banner.isVisible(), "the fault is gone")
         self.operator.until(
@@ -251,25 +300,36 @@ class Night:
         banner = self.window.alarm_banner
         self.operator.until(banner.isVisible, "the alarm is shown")
         assert "Residual" in banner.text.text()
+        self.events += ["ALARM: Residual", "above 1 nm rms"]
         self.images("alarm")
         self.key(Qt.Key.Key_K, Qt.KeyboardModifier.ControlModifier)
         self.operator.until(lambda: not banner.isVisible(), "it is acknowledged")
         self.window._settings.alarms.clear()
 
     def export_log(self) -> None:
-        """Keep the log of the night.
-
-        This step takes whatever the window offers for it: at present the lines of the log panel.
-        """
+        """Write a note into the log of the night, and export it as a page with figures."""
         if self.state.loop.closed:
             self.open()
         self.key(Qt.Key.Key_3, Qt.KeyboardModifier.ControlModifier)
-        self.operator.press(self.log.copy_button)
-        text = QApplication.clipboard().text()
-        for event in ("loop closed", "the loop is opened", "has control"):
-            assert event in text.lower(), f"{event} is not in the log:\n{text}"
-        if self.folder is not None:
-            (self.folder / "night.txt").write_text(text)
+        note = "clouds from the west, <seeing> worse"
+        self.log.note.setFocus()
+        QTest.keyClicks(self.log.note, note)
+        QTest.keyClick(self.log.note, Qt.Key.Key_Return)
+        self.operator.until(lambda: note in self.log.text.toPlainText(), "the note is listed")
+        assert not self.log.note.text()
+        self.images("night_log")
+        with tempfile.TemporaryDirectory() as temporary:
+            page = (self.folder or Path(temporary)) / "night.html"
+            self.log.export_to(page)
+            self.operator.until(
+                lambda: self.log.message.text().startswith(("Written", "Not written")), "it is exported"
+            )
+            assert self.log.message.text() == f"Written: {page}"
+            content = page.read_text()
+        assert escape(note) in content
+        assert "<svg" in content, "figures"
+        for event in self.events:
+            assert event in content, f"{event} is not in the log:\n{self.log.text.toPlainText()}"
 
     # ------------------------------------------------------------ parts of steps
     def key(
@@ -310,18 +370,22 @@ class Night:
         self.key(Qt.Key.Key_2, Qt.KeyboardModifier.ControlModifier)
         ended = self.operator.run(name, **arguments)
         assert ended.finish is Finish.DONE, ended.message
+        folder = f" [{Path(ended.folder).name}]" if ended.folder else ""
+        self.events += [f"run {ended.id}, {name}: started", f"run {ended.id}, {name}: done{folder}"]
         return ended
 
     def hold_to_close(self) -> None:
         self.key(Qt.Key.Key_3, Qt.KeyboardModifier.ControlModifier)
         self.hold(self.loop.close_button)
         self.operator.until(lambda: self.state.loop.closed, "the loop is closed")
+        self.events.append(escape(f"loop closed on '{self.state.loop.matrix}', gain"))
 
     def open(self) -> None:
         """Open the loop with the button that is always visible."""
         self.operator.press(self.window.header.open_button)
         self.operator.until(lambda: not self.state.loop.closed, "the loop is open")
         self.operator.until(lambda: self.state.phase is Phase.IDLE, "the engine is idle")
+        self.events.append("loop opened")
 
     def clear_fault(self) -> None:
         button = self.window.fault_banner.button
@@ -414,11 +478,9 @@ class Night:
 
 #: The night, in its order; the first one connects.
 STEPS = (
-    "start", "align", "calibrate", "close", "gain", "poke", "record", "crash", "take_over", "reload", "alarm",
-    "export_log",
+    "start", "align", "calibrate", "close", "gain", "poke", "poke_actuator", "record", "crash", "take_over",
+    "reload", "alarm", "export_log",
 )  # fmt: skip
-#: Steps that can be repeated at any moment.
-REPEATED = ("align", "calibrate", "gain", "poke", "record", "reload", "alarm")
 
 
 def say(word: str, **content: object) -> None:

@@ -336,8 +336,8 @@ class ScriptedControl:
         """What a poke would do."""
         self._note("check_poke", kind=kind, number=number, amplitude=amplitude, seconds=seconds)
         return PokePlan(
-            description=f"{kind} {number + 1} at {amplitude:+g}", peak=abs(amplitude), peak_nm=150.0,
-            allowed=0.4, refusal=self.refusal,
+            description=f"{kind} {number + 1} at {amplitude:+g} of the stroke (+150 nm of surface)",
+            peak=abs(amplitude), peak_nm=150.0, allowed=0.4, refusal=self.refusal,
         )  # fmt: skip
 
     def plan(self, procedure: str, arguments: Arguments) -> ProcedurePlan:

@@ -6,11 +6,11 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from gui_windows import click_pixel
 from PySide6.QtCore import Qt
 from PySide6.QtTest import QTest
 from pytestqt.qtbot import QtBot
 from scripted import ScriptedControl, ScriptedSource
-from test_images import click_pixel
 
 from escape_gui.main_window import MainWindow
 from escape_gui.panels.camera import CameraPanel
@@ -142,6 +142,8 @@ def test_an_actuator_is_poked_by_arming_clicking_and_holding(
     qtbot.mouseRelease(mirror.poke_button, Qt.MouseButton.LeftButton)
     qtbot.waitUntil(lambda: "poke" in control.verbs)
     assert control.asked[-1] == ("poke", {"args": ("actuator", number, 0.05, 2.0)})
+    # The next key is for no other widget when the button is disabled.
+    assert window.focusWidget() is mirror.arm_button
 
 
 def test_a_refused_poke_cannot_be_held(

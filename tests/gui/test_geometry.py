@@ -10,6 +10,7 @@ import pytest
 from gui_windows import dispose, show_window
 from PySide6.QtCore import QPoint, QRect, Qt
 from PySide6.QtWidgets import QApplication, QScrollArea, QTabBar, QWidget
+from pytestqt.qtbot import QtBot
 from scripted import ScriptedSource
 
 from escape_gui.client.session import Session
@@ -18,7 +19,14 @@ from escape_gui.settings import Settings
 from escape_gui.window.docks import WORKSPACES
 from escape_hw.api.registration import TO_STREAM_UNITS
 from escape_hw.io.documents import calibration_document
-from escape_hw.remote.state import Finish, FinishedRun, ProcedureEntry, ProcedureParameter
+from escape_hw.remote.state import (
+    Finish,
+    FinishedRun,
+    LoopState,
+    Phase,
+    ProcedureEntry,
+    ProcedureParameter,
+)
 
 Show = Callable[[Settings], MainWindow]
 RESULT = fake.calibration("escape", n=8, n_modes=6)
@@ -123,3 +131,36 @@ def test_panels_and_their_tabs_fit_the_narrowest_window(
             assert bar.elideMode() is Qt.TextElideMode.ElideNone
             last = bar.tabRect(bar.count() - 1)
             assert bar.rect().contains(last), [bar.tabText(k) for k in range(bar.count())]
+
+
+def assert_is_in_its_dock(widget: QWidget, window: MainWindow, panel: str) -> None:
+    """The whole widget is visible without scrolling."""
+    area = window.docks[panel].widget()
+    assert isinstance(area, QScrollArea)
+    place = QRect(widget.mapTo(area.viewport(), QPoint(0, 0)), widget.size())
+    assert widget.isVisible()
+    assert area.viewport().rect().contains(place), f"{place} is not inside {area.viewport().rect()}"
+
+
+@pytest.mark.parametrize(
+    ("workspace", "panel", "button"),
+    [("operate", "loop", "close_button"), ("align", "mirror", "poke_button")],
+)
+def test_buttons_that_are_held_are_visible_in_the_narrowest_window(
+    workspace: str, panel: str, button: str, show: Show, source: ScriptedSource, qtbot: QtBot
+) -> None:
+    source.change(phase=Phase.IDLE, loop=LoopState(matrix="escape", gain=0.425, leak=0.026), active_run=None)
+    window = show(Settings(workspace=workspace))
+    window.resize(1024, 700)
+    found = window.panels[panel]
+    if panel == "mirror":
+        found.arm_button.click()
+        qtbot.waitUntil(lambda: "nm of surface" in found.poke_text.text())
+    for _ in range(5):
+        window.update_timer.tick(force=True)
+        QApplication.processEvents()
+    if panel == "mirror":
+        found.poke_text.setText(f"Mirror flat again after: {found._plan.description}")
+        QApplication.processEvents()
+        assert found.image_view.geometry().bottom() < found.arm_button.geometry().top()
+    assert_is_in_its_dock(getattr(window.panels[panel], button), window, panel)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar
@@ -165,6 +166,21 @@ def test_mirror_shows_peak_and_clipping(window: MainWindow, source: ScriptedSour
     assert [readouts[name].text for name in ("rms", "peak", "clipped")] == ["0.0812", "0.8000", "3.10"]
 
 
+def test_the_log_shows_local_time(
+    window: MainWindow, source: ScriptedSource, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TZ", "Pacific/Honolulu")
+    time.tzset()
+    try:
+        log = panel_of(window, LogPanel)
+        log.apply_theme()
+        # 21:00 UTC.
+        assert log.text.toPlainText().startswith("11:00:0")
+    finally:
+        monkeypatch.undo()
+        time.tzset()
+
+
 def test_log_search_level_and_copy(window: MainWindow, source: ScriptedSource) -> None:
     for k in range(1, 7):
         source.push_all(k)
@@ -302,3 +318,23 @@ def test_a_missing_reference_psf_is_shown(make_window: MakeWindow, source: Scrip
     window.update_timer.tick(force=True)
     assert psf.captions["model_psf"].text() == "PSF: reference (- -)"
     assert not performance.reference_missing_label.isVisible()
+
+
+def test_a_chart_without_data_has_a_plain_axis_and_a_low_one_a_short_title(
+    window: MainWindow, qtbot: QtBot
+) -> None:
+    panel = panel_of(window, PerformancePanel)
+    panel.show_placeholder(False)
+    panel.strehl.show_history(LoopHistory().strehl, 0.0)
+    assert panel.strehl.getPlotItem().getViewBox().viewRange()[1][1] >= 100
+    for height, title in ((400, "residual [nm rms]"), (90, "[nm rms]")):
+        panel.residual.setFixedHeight(height)
+        qtbot.waitUntil(lambda title=title: panel.residual.getAxis("left").labelText == title)
+
+
+def test_the_scale_of_a_mirror_without_commands_is_flat(window: MainWindow, source: ScriptedSource) -> None:
+    panel = panel_of(window, MirrorPanel)
+    assert panel.scale.text().startswith("±")
+    source.push("commands", np.zeros_like(source.latest("commands").data))
+    window.update_timer.tick(force=True)
+    assert panel.scale.text() == "flat"

@@ -6,9 +6,9 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from gui_windows import click_pixel
 from PySide6.QtCore import QPoint, Qt
 from PySide6.QtTest import QTest
-from PySide6.QtWidgets import QApplication
 from pytestqt.qtbot import QtBot
 from scripted import ScriptedSource
 
@@ -16,17 +16,9 @@ from escape_gui.main_window import MainWindow
 from escape_gui.panels.camera import CameraPanel
 from escape_gui.panels.psf import PsfPanel
 from escape_gui.views.images import FrameAverage
-from escape_gui.widgets.images import ImageToolbar, ImageViewer
+from escape_gui.widgets.images import ImageToolbar
 
 MakeWindow = Callable[..., MainWindow]
-
-
-def click_pixel(view: ImageViewer, x: int, y: int, *, twice: bool = False) -> None:
-    """Click the middle of a pixel."""
-    place = view.view.mapFromScene(view.image.mapToScene(x + 0.5, y + 0.5))
-    press = QTest.mouseDClick if twice else QTest.mouseClick
-    press(view.view.viewport(), Qt.MouseButton.LeftButton, pos=QPoint(place.x(), place.y()))
-    QApplication.processEvents()
 
 
 def choose(bar: ImageToolbar, kind: str, value: object, qtbot: QtBot) -> None:

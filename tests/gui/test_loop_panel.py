@@ -111,6 +111,19 @@ def test_the_result_stays_until_the_next_edit(
     assert "Applied" not in loop.message.text()
 
 
+def test_the_result_goes_when_the_loop_is_opened(
+    typist: Typist, loop: LoopPanel, control: ScriptedControl, qtbot: QtBot
+) -> None:
+    typist.type(loop.leak, "0.05")
+    loop.check()
+    loop.apply()
+    qtbot.waitUntil(lambda: "Applied" in loop.message.text())
+    # A further key reverts nothing.
+    assert loop.window().focusWidget() is loop.check_button
+    typist.new_state(closed=False)
+    assert loop.message.text() == ""
+
+
 @pytest.mark.parametrize(
     ("field", "text", "message"),
     [

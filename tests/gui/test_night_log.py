@@ -129,6 +129,32 @@ def test_trends_are_drawn_over_hours_and_over_nights(
     settle()
 
 
+def test_a_low_axis_has_no_more_numbers_than_fit(make_window) -> None:
+    panel = make_window((TrendsPanel,)).panels["trends"]
+    axis = panel.plot._plots[0].getAxis("left")
+    assert [len(axis.tickValues(0.4, 1.4, size)[0][1]) for size in (400.0, 40.0)] == [5, 3]
+
+
+def test_the_newest_entry_is_shown_until_the_operator_scrolls_up(make_window, source: ScriptedSource) -> None:
+    window: MainWindow = make_window((NightPanel,))
+    panel = window.panels["night"]
+    bar = panel.text.verticalScrollBar()
+    window.resize(900, 300)
+    source.night = [entry(k, "note", f"{k} some words about the wind and the clouds") for k in range(40)]
+    panel.tick(source)
+    settle()
+    # Narrower: the lines wrap.
+    window.resize(340, 300)
+    settle()
+    panel.tick(source)
+    assert bar.maximum() > 0
+    assert bar.value() == bar.maximum()
+    bar.triggerAction(bar.SliderAction.SliderToMinimum)
+    source.night.append(entry(40, "note", "new"))
+    panel.tick(source)
+    assert bar.value() == 0
+
+
 def test_gaps_and_relative_values_of_trends():
     history = TrendHistory()
     history.add(entry(k, "sample", seconds=s, strehl=40.0 + k) for k, s in enumerate((900, 890, 100, 90)))

@@ -6,9 +6,11 @@ from pathlib import Path
 
 import pytest
 import serving
+from gui_windows import click_pixel
 from PIL import Image
 from PySide6.QtCore import Qt
 from PySide6.QtTest import QTest
+from PySide6.QtWidgets import QWidget
 from whole_run import Operator, operating
 
 from escape_hw.remote.state import Phase
@@ -18,17 +20,51 @@ FIGURES = Path(__file__).parents[2] / "docs" / "figures" / "gui"
 pytestmark = [pytest.mark.screenshots, pytest.mark.timeout(1800)]
 
 
-def save_image(operator: Operator, name: str) -> None:
-    """Save an image of the window with 256 colours, for small files."""
+def save_image(operator: Operator, name: str, part: QWidget | None = None) -> None:
+    """Save an image of the window, or of a part of it, with 256 colours, for small files."""
     for note in tuple(operator.window.notifications.notifications):
         note.close_button.click()
     operator.settle(1.0)
     FIGURES.mkdir(exist_ok=True)
     path = FIGURES / f"{name}.png"
-    assert operator.window.grab().save(str(path))
+    assert (part or operator.window).grab().save(str(path))
     with Image.open(path) as image:
         few = image.convert("RGB").quantize(256)
     few.save(path, optimize=True)
+
+
+def save_camera_dialog(operator: Operator) -> None:
+    """Another exposure of the sensor's camera, checked but not applied."""
+    dialog, camera = operator.window.camera_dialogs["wfs"], operator.window.panels["camera"]
+    operator.press(camera.settings_button)
+    operator.until(dialog.check_button.isEnabled, "the settings are shown")
+    field = dialog.fields["exposure_s"]
+    field.setFocus()
+    field.selectAll()
+    QTest.keyClicks(field, "1.5")
+    operator.press(dialog.check_button)
+    operator.until(dialog.apply_button.isEnabled, dialog.message.text())
+    save_image(operator, "camera", dialog)
+    dialog.reject()
+
+
+def save_poke(operator: Operator) -> None:
+    """A poke of an actuator while it is held."""
+    mirror, source = operator.window.panels["mirror"], operator.window.context.session
+    operator.press(mirror.arm_button)
+    operator.settle(0.5)
+    rows, columns = mirror._map.numbers.shape
+    click_pixel(mirror.image_view, columns // 3, rows // 3)
+    mirror.poke_seconds.setValue(10.0)
+    mirror._on_poke_edit()
+    operator.until(mirror.poke_button.isEnabled, "it can be poked")
+    QTest.mousePress(mirror.poke_button, Qt.MouseButton.LeftButton)
+    operator.settle(1.5)
+    QTest.mouseRelease(mirror.poke_button, Qt.MouseButton.LeftButton)
+    operator.until(lambda: source.source.state.mirror.peak > 0.01, "it is poked")
+    save_image(operator, "poke", operator.window.docks["mirror"])
+    operator.until(lambda: source.source.state.active_run is None, "it ends")
+    operator.press(mirror.arm_button)
 
 
 def test_images_of_the_tutorial(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -41,6 +77,8 @@ def test_images_of_the_tutorial(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
         window.show_workspace("align")
         operator.settle(3.0)
         save_image(operator, "align")
+        save_camera_dialog(operator)
+        save_poke(operator)
 
         window.show_workspace("calibrate")
         operator.choose("escape", frames="2000")

@@ -112,6 +112,15 @@ def test_all_views_show_the_analysis_in_both_themes(
     assert names == ["spectra", "modes"]
 
 
+def test_axes_without_data_have_no_numbers(window: MainWindow, panel: TelemetryPanel):
+    plot = panel.residual
+    assert not any(axis.style["showValues"] for axis in plot._axes)
+    plot.show_modes(np.ones(5), np.ones(5))
+    assert all(axis.style["showValues"] for axis in plot._axes)
+    window.context.theme.set_palette("light")
+    assert all(axis.style["showValues"] for axis in plot._axes)
+
+
 def test_a_damaged_recording_says_so(panel: TelemetryPanel, tmp_path: Path):
     panel.open_recording(tmp_path)
     wait_for(lambda: panel.message.isVisibleTo(panel))

@@ -40,7 +40,7 @@ def calibrated(operator: Operator, ended: FinishedRun) -> None:
     product = load_matrix(ended.products["im"])
     operator.until(lambda: modes.matrix_selector.currentText() == "ESCAPE", "the newest is in front")
     np.testing.assert_array_equal(modes.matrices["ESCAPE"].data, product.matrix.data)
-    assert "Shift X" in operator.procedure.numbers.text()
+    assert "Shift x" in operator.procedure.numbers.text()
     assert operator.procedure.report.isVisible()
     assert Path(ended.products["report"]).is_file()
 

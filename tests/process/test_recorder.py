@@ -18,11 +18,13 @@ import pytest
 
 from escape_hw.cli import main
 from escape_hw.errors import ProductError
+from escape_hw.remote.state import RecordingState
+from escape_hw.server.engine.publisher import TelemetryRecording
 from escape_hw.streams import segments
 from escape_hw.streams.recording import recorder as module
 from escape_hw.streams.recording.block_file import HEADER, read_recording, write_block
 from escape_hw.streams.recording.process import RecorderProcess
-from escape_hw.streams.recording.recorder import StreamRecorder
+from escape_hw.streams.recording.recorder import RecordingProgress, StreamRecorder
 from escape_hw.streams.ring import RingReader, RingWriter
 from escape_hw.streams.segments import segment_name
 
@@ -315,3 +317,20 @@ def test_a_recorder_whose_parent_is_killed_prints_nothing(tmp_path: Path) -> Non
     )
     assert done.returncode == -9
     assert done.stderr == ""
+
+
+def test_a_recording_that_is_being_stopped_is_published_as_one_that_runs(tmp_path: Path) -> None:
+    class Process:
+        """A recorder that writes its queue while another thread publishes the state."""
+
+        state, folder = RecordingProgress(written=700), tmp_path
+
+        def stop(self) -> RecordingProgress:
+            seen.append(recording.state())
+            return RecordingProgress(written=900)
+
+    seen: list[RecordingState] = []
+    recording = TelemetryRecording(tmp_path, publisher=None, describe=None)
+    recording._process = Process()
+    ended = recording.set_recording(False)
+    assert [(one.recording, one.written) for one in (*seen, ended)] == [(True, 700), (False, 900)]

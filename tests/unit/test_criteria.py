@@ -40,6 +40,19 @@ def test_a_worse_strehl_ratio_is_not_met():
     assert met(escape=fake.loop(strehl=0.5)) == [True, True, False, False, False]
 
 
+def test_a_difference_within_the_margin_is_met_and_one_beyond_it_is_not():
+    for below, expected in ((0.0035, True), (0.0075, False)):
+        ours, theirs = (
+            replace(
+                fake.loop(),
+                strehl=StrehlEstimate(*3 * [Estimate(value, 5e-4)]),
+            )
+            for value in (0.6 - below, 0.6)
+        )
+        found = criteria.loop_criteria({"push-pull": theirs, "ESCAPE": ours})
+        assert [check["met"] for check in found] == [True, True] + 3 * [expected]
+
+
 def test_a_ratio_without_an_error_says_so_in_the_table():
     unknown = StrehlEstimate(UNKNOWN, UNKNOWN, UNKNOWN)
     row = strehl_table({"ESCAPE": replace(fake.loop(), strehl=unknown)}).rows[0]

@@ -211,7 +211,7 @@ def test_a_result_is_compared_with_the_one_before():
     now = {"registration": {"shift_x": {"value": 3.0, "sigma": 0.3}}, "gain": 1.02, "snr": {"min": 9.0}}
     before = {"registration": {"shift_x": {"value": 1.0, "sigma": 0.4}}, "gain": 1.0, "snr": {"min": 7.0}}
     lines = form.comparison_lines(now, before)
-    assert lines[0] == "Shift X: 3.00 ± 0.30 % sub-ap. (Δ 2.00 ± 0.50)"
+    assert lines[0] == "Shift x: 3.00 ± 0.30 % sub-ap. (Δ 2.00 ± 0.50)"
     assert lines[1] == "Gain of the matrix: 1.02 (before: 1)"
     assert lines[2] == "SNR of the worst mode: 9 (before: 7)"
     assert form.comparison_lines({}, None) == []
@@ -226,7 +226,7 @@ def test_results_of_every_procedure_are_stated_in_numbers():
         "Gain of the loop: 0.4 (before: 0.4)",
         "Residual: 44.2 nm rms (before: 44.2 nm rms)",
         "Strehl ratio: 36.5 % (before: 30.0 %)",
-        "Frames: 2,000, 4.0 s (simulated), 3 lost",
+        "Frames: 2000, 4.0 s (simulated), 3 lost",
     ]
     gains = {"optical_gain": [0.5, 0.7], "exchanges": [{"accepted": True}, {}], "alarms": [{}]}
     assert form.comparison_lines(gains, None) == [

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from escape_hw.config.loader import load_system
+from escape_hw.io import night_log
 from escape_hw.io.night_log import NightLogWriter, find_nights, night_of, night_path, read_night, system_of
 from escape_hw.pipeline.seeing import (
     FIRST_MODE,
@@ -67,6 +68,16 @@ def test_every_entry_is_on_disk_and_a_restart_continues(tmp_path: Path):
     assert later.add("note", "clear").number == 2
 
 
+def test_numbers_go_on_when_the_server_is_started_in_the_next_night(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    NightLogWriter(tmp_path, "bench", simulated=True).add("note", "yesterday")
+    monkeypatch.setattr(night_log, "night_of", lambda moment: "2126-01-01")
+    writer = NightLogWriter(tmp_path, "bench", simulated=True)
+    assert writer.earlier == []
+    assert writer.add("note", "today").number == 1
+
+
 def test_a_line_that_a_crash_cut_is_left_out_and_the_next_one_is_whole(tmp_path: Path):
     NightLogWriter(tmp_path, "bench", simulated=True).add("note", "first")
     (path,) = find_nights(tmp_path)
@@ -88,7 +99,10 @@ CLOSED = State(
     phase=Phase.LOOP, engine_pid=5, loop=LoopState(closed=True, matrix="escape-3", gain=0.4, leak=0.01)
 )
 IDLE = State(phase=Phase.IDLE, engine_pid=5, loop=LoopState(matrix="escape-3", gain=0.4, leak=0.01))
-RUN = ActiveRun(id=4, name="docrime", arguments={"frames": 1000, "snr": None})
+POKE = ActiveRun(id=0, name="poke", arguments={}, stage="actuator 19 at +0.05 of the stroke")
+RUN = ActiveRun(
+    id=4, name="docrime", arguments={"frames": 1000, "snr": None, "extra_parameters": "", "sky_time": True}
+)
 
 
 @pytest.mark.parametrize(
@@ -102,7 +116,16 @@ RUN = ActiveRun(id=4, name="docrime", arguments={"frames": 1000, "snr": None})
             CLOSED.model_copy(update={"loop": CLOSED.loop.model_copy(update={"gain": 0.5})}),
             ["loop now on 'escape-3', gain 0.5, leak 0.01, 0 modes dropped"],
         ),
-        (IDLE, IDLE.model_copy(update={"active_run": RUN}), ["run 4, docrime: started (frames 1000)"]),
+        (
+            IDLE,
+            IDLE.model_copy(update={"active_run": POKE}),
+            ["poke of actuator 19 at +0.05 of the stroke"],
+        ),
+        (
+            IDLE,
+            IDLE.model_copy(update={"active_run": RUN}),
+            ["run 4, docrime: started (frames 1000, sky time yes)"],
+        ),
         (
             IDLE,
             IDLE.model_copy(update={"fault": FaultState(reason="no frame", at_utc="")}),

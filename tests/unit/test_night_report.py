@@ -59,8 +59,10 @@ def test_markdown_has_the_log_the_medians_and_figures_beside_it(runs: Path, tmp_
     text, *figures = report.write(tmp_path / "my night.md")
     content = text.read_text()
     assert "**SIMULATED**" in content
-    assert "| Strehl ratio | 42 (40.6 to 43.4) % |" in content
-    assert "| Seeing at 500 nm | 1.01 (1.01 to 1.01) arcsec |" in content
+    assert "| Strehl ratio | 42.0 (40.6 to 43.4) % |" in content
+    assert "| Shift x | -14.0 (-15.4 to -12.6) % of a sub-aperture |" in content
+    # All values are equal.
+    assert "| Seeing at 500 nm | 1.01 arcsec |" in content
     assert "note, ana: <b>first light" in content
     assert "FAULT: no frame" in content
     assert [path.name for path in figures] == ["my night_night.png", "my night_nights.png"]

@@ -207,6 +207,8 @@ class TelemetryRecording:
 
     def _finish(self, process: RecorderProcess) -> None:
         """Wait until everything is on disk; the state is that of the end."""
+        # What another thread publishes meanwhile: it records, with the entries written so far.
+        self._last = self._progress(process.state)
         self._process = None
         end = process.stop()
         self._last = self._progress(end).model_copy(update={"recording": False})

@@ -36,6 +36,8 @@ class PublishedState:
 
     def __init__(self, state: State, leases: LeaseManager, transport: ZmqTransport) -> None:
         self.state, self._leases, self._transport = state, leases, transport
+        #: Number of the newest entry of the night log.
+        self.last_night_entry = -1
 
     def update(self, state: State | None = None) -> None:
         """Publish a new state of the engine, or the present one with new front-end values."""
@@ -45,7 +47,7 @@ class PublishedState:
                 "serial": before.serial + 1, "server_pid": before.server_pid, "lease": self._leases.lease,
                 "clients": self._leases.count, "refused_requests": self._transport.refused,
                 "notes": before.notes, "unattended_for_s": self._leases.seconds_without_holder(),
-                "unattended_limit_s": before.unattended_limit_s,
+                "unattended_limit_s": before.unattended_limit_s, "last_night_entry": self.last_night_entry,
             }
         )  # fmt: skip
         self._transport.publish("state", self.state)

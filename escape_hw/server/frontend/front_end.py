@@ -16,6 +16,7 @@ from zmq.auth.thread import ThreadAuthenticator
 from escape_hw.api.procedure import StopSignal
 from escape_hw.config.system import SystemConfig
 from escape_hw.errors import EscapeError, RequestRefused
+from escape_hw.io.night_log import NightEntry
 from escape_hw.io.provenance import format_utc, get_software_version
 from escape_hw.remote import requests
 from escape_hw.remote.address import Endpoint, is_loopback, tcp_endpoint
@@ -69,7 +70,7 @@ class FrontEnd:
             notes=self._journal.read_previous_end(), unattended_limit_s=config.server.unattended_s,
         )  # fmt: skip
         self._published = PublishedState(state, self._leases, transport)
-        self._night_log = NightLog(config, runs, lambda entry: transport.publish("night", entry))
+        self._night_log = NightLog(config, runs, self._publish_night_entry)
         self._night_log.start(state.notes)
         #: Requests that the engine has not answered yet, and when they were forwarded (monotonic seconds).
         self._pending: dict[int, tuple[IncomingRequest, float]] = {}
@@ -149,6 +150,10 @@ class FrontEnd:
             f"(limit {limit:g} s)",
             "The measured data are saved. Clear the fault, and resume the run if it should continue.",
         )
+
+    def _publish_night_entry(self, entry: NightEntry) -> None:
+        self._transport.publish("night", entry)
+        self._published.last_night_entry = entry.number
 
     # ------------------------------------------------------------ messages of the engine
     def _on_engine_message(self, message: dict[str, Any]) -> None:

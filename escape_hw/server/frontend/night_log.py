@@ -127,8 +127,16 @@ def describe_changes(before: State, after: State) -> Iterator[tuple[Kind, str]]:
         yield "event", f"another engine: process {after.engine_pid}"
     yield from _describe_loop(before, after)
     run, last_run = after.active_run, before.active_run
-    if run is not None and (last_run is None or run.id != last_run.id):
-        words = ", ".join(f"{key} {value}" for key, value in run.arguments.items() if value is not None)
+    if run is not None and run.name == "poke":
+        if last_run is None:
+            # The stage of a poke, which is no run, is its description.
+            yield "event", f"poke of {run.stage}"
+    elif run is not None and (last_run is None or run.id != last_run.id):
+        words = ", ".join(
+            f"{key.replace('_', ' ')} {_argument_text(value)}"
+            for key, value in run.arguments.items()
+            if value is not None and value != ""
+        )
         yield "event", f"run {run.id}, {run.name}: started" + (f" ({words})" if words else "")
     if after.recording.recording and not before.recording.recording:
         yield "event", f"recording telemetry [{Path(after.recording.path).name}]"
@@ -139,6 +147,10 @@ def describe_changes(before: State, after: State) -> Iterator[tuple[Kind, str]]:
     holder, earlier = after.lease, before.lease
     if holder is not None and (earlier is None or holder.client != earlier.client):
         yield "event", f"{holder.name} on {holder.host} has control"
+
+
+def _argument_text(value: object) -> str:
+    return {True: "yes", False: "no"}[value] if isinstance(value, bool) else str(value)
 
 
 def _describe_loop(before: State, after: State) -> Iterator[tuple[Kind, str]]:
