@@ -8,6 +8,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 from PySide6.QtCore import Signal
+from PySide6.QtGui import QResizeEvent
 from PySide6.QtWidgets import QHBoxLayout, QLabel, QSizePolicy
 
 from escape_gui.panels.base import Context, ExportArray, Panel
@@ -155,12 +156,7 @@ class PsfPanel(Panel):
             self.shape = None
             self.shape_text.setText(f"no width: {error}")
             return
-        text = format_shape(self.shape, self.bench_geometry.psf_px)
-        metrics, margins = self.shape_text.fontMetrics(), self.body.contentsMargins()
-        room = self.width() - margins.left() - margins.right()
-        fits = max(map(metrics.horizontalAdvance, text.splitlines())) <= room
-        self.shape_text.setText(text if fits else format_widths(self.shape))
-        self.shape_text.setToolTip(text)
+        self._show_shape()
         if self.choice.selected != ENERGY:
             return
         for key, view in self.image_views.items():
@@ -168,6 +164,21 @@ class PsfPanel(Panel):
                 clean = subtract_background(view.data)
                 peak = np.unravel_index(int(np.argmax(clean)), clean.shape)
                 self._energy_curves[key].setData(*encircled_energy(clean, (float(peak[0]), float(peak[1]))))
+
+    def _show_shape(self) -> None:
+        """Show the numbers of the shape; in a narrow panel only the widths."""
+        if self.shape is None:
+            return
+        text = format_shape(self.shape, self.bench_geometry.psf_px)
+        metrics, margins = self.shape_text.fontMetrics(), self.body.contentsMargins()
+        room = self.width() - margins.left() - margins.right()
+        fits = max(map(metrics.horizontalAdvance, text.splitlines())) <= room
+        self.shape_text.setText(text if fits else format_widths(self.shape))
+        self.shape_text.setToolTip(text)
+
+    def resizeEvent(self, event: QResizeEvent) -> None:
+        super().resizeEvent(event)
+        self._show_shape()
 
     def on_geometry(self) -> None:
         # lambda/D is known now.

@@ -9,6 +9,7 @@ import pytest
 from gui_windows import click_pixel
 from PySide6.QtCore import QPoint, Qt
 from PySide6.QtTest import QTest
+from PySide6.QtWidgets import QApplication
 from pytestqt.qtbot import QtBot
 from scripted import ScriptedSource
 
@@ -113,7 +114,13 @@ def test_width_and_encircled_energy_of_the_psf(
     fwhm = 2.3548 * sigma
     assert psf.shape is not None
     assert psf.shape.fwhm == pytest.approx(fwhm, rel=0.01)
-    assert f"FWHM {psf.shape.fwhm:.2f} px ({psf.shape.fwhm / 2.46:.2f} λ/D)" in psf.shape_text.text()
+    # All numbers where there is room for them.
+    for width, energy in ((900, "80 % within"), (300, "80 % 3.")):
+        psf.setFixedWidth(width)
+        QApplication.processEvents()
+        assert f"FWHM {psf.shape.fwhm:.2f} px" in psf.shape_text.text()
+        assert energy in psf.shape_text.text()
+        assert f"FWHM {psf.shape.fwhm:.2f} px ({psf.shape.fwhm / 2.46:.2f} λ/D)" in psf.shape_text.toolTip()
     qtbot.mouseClick(psf.choice.buttons["energy"], Qt.MouseButton.LeftButton)
     radius, share = psf._energy_curves["psf"].getData()
     assert np.interp(sigma * np.sqrt(2 * np.log(2)), radius, share) == pytest.approx(0.5, abs=0.03)

@@ -37,7 +37,7 @@ def save_camera_dialog(operator: Operator) -> None:
     """Another exposure of the sensor's camera, checked but not applied."""
     dialog, camera = operator.window.camera_dialogs["wfs"], operator.window.panels["camera"]
     operator.press(camera.settings_button)
-    operator.until(dialog.check_button.isEnabled, "the settings are shown")
+    operator.until(lambda: dialog._current is not None, "the settings are shown")
     field = dialog.fields["exposure_s"]
     field.setFocus()
     field.selectAll()
