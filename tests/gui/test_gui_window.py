@@ -171,7 +171,7 @@ def test_the_form_and_its_result_have_room(make_window: MakeWindow, source: Scri
         unit = next(
             one
             for one in field.parentWidget().findChildren(QLabel)
-            if one.text() in ("of full stroke", "% sub-ap.", "frame")
+            if one.text() in ("of full stroke", "% sub-ap.", "frames")
             and one.geometry().center().y() - field.geometry().center().y() in (-1, 0, 1)
         )
         assert unit.geometry().left() - field.geometry().right() > 8
