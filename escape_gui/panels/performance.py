@@ -37,8 +37,8 @@ class PerformancePanel(Panel):
     def __init__(self, context: Context) -> None:
         super().__init__(context)
         theme = context.theme
-        self.strehl = StripChart(theme, "Strehl ratio over time", "Strehl ratio [%]", number=0, empty_top=100)
-        self.residual = StripChart(theme, "Residual over time", "residual [nm rms]", number=1, empty_top=100)
+        self.strehl = StripChart(theme, "Strehl ratio over time", "Strehl ratio [%]", number=0)
+        self.residual = StripChart(theme, "Residual over time", "residual [nm rms]", number=1)
         self.residual.setXLink(self.strehl)
         self.strehl.hide_bottom_label()
         self.readouts = {

@@ -24,6 +24,8 @@ DASHES = (
 )  # fmt: skip
 #: Room between two plots above each other.
 _ROW_GAP_PX = 8
+#: Vertical range of a chart without data.
+_EMPTY_RANGE = (0.0, 100.0)
 #: Markers by number of the curve: pyqtgraph's name, and the character for it in texts.
 MARKERS = (("o", "●"), ("s", "■"), ("t1", "▲"), ("d", "◆"), ("t", "▼"), ("star", "★"))
 
@@ -65,9 +67,9 @@ class Plot(pg.PlotWidget):  # type: ignore[misc]
         self._curves.append((item, number, alone))
         return item
 
-    def pin_left_axis(self) -> None:
+    def pin_left_axis(self, characters: int = 6) -> None:
         """Fix the width of the left axis, so that plots above each other are aligned."""
-        self.getAxis("left").setWidth(self._theme.pixels(54))
+        self.getAxis("left").setWidth(self._theme.pixels(9 * characters))
 
     def hide_bottom_label(self) -> None:
         del self._labels["bottom"]
@@ -114,25 +116,23 @@ class SectionPlot(Plot):
 
 
 class StripChart(Plot):
-    """A quantity over the last seconds, see :meth:`set_span`; without data, its axis ends at ``empty_top``.
+    """A quantity over the last ``span_s`` seconds."""
 
-    A low chart has the unit only, ``[...]`` at the end of ``y``, as title of its axis.
-    """
-
-    def __init__(self, theme: Theme, name: str, y: str, number: int = 0, empty_top: float = 1.0) -> None:
-        self._title, self._empty_top = y, empty_top
+    def __init__(self, theme: Theme, name: str, y: str, number: int = 0) -> None:
+        self._title = y
         super().__init__(theme, name, "time before now [s]", y)
         self._line = self.curve(number, alone=True, connect="finite")
         # Room for the upper half of the highest tick label.
         self.getPlotItem().layout.setContentsMargins(1, 8, 1, 1)
         # Hours are more points than pixels.
         self._line.setDownsampling(auto=True, method="peak")
-        self.setYRange(0, empty_top)
+        self.setYRange(*_EMPTY_RANGE)
         self.pin_left_axis()
         self.set_span(120.0)
         self.getPlotItem().getViewBox().sigResized.connect(lambda _: self._fit_title())
 
     def _fit_title(self) -> None:
+        """A low chart has only the unit, ``[...]`` at the end of the title, along its axis."""
         axis, metrics = self.getAxis("left"), QFontMetricsF(self._theme.font(0.85))
         fits = metrics.horizontalAdvance(self._title) <= axis.size().height() + _ROW_GAP_PX
         label = self._title if fits else self._title[self._title.index("[") :]
@@ -154,7 +154,7 @@ class StripChart(Plot):
         if np.isfinite(values[first:]).any():
             self.getPlotItem().enableAutoRange(axis="y")
         else:
-            self.setYRange(0, self._empty_top)
+            self.setYRange(*_EMPTY_RANGE)
         self._line.setData((times[first:] - now) / self._unit_s, values[first:])
 
 
