@@ -211,6 +211,8 @@ def write_results(folder: Path, runs: Mapping[str, Path]) -> Path:
     lines = ["# The paper's numbers and ours", ""]
     if simulated:
         lines += ["SIMULATED: ours come from simulations.", ""]
+    if commits := sorted({str(run.document["git"]) for run in contents.values() if "git" in run.document}):
+        lines += [f"Commit of the software: {', '.join(commits)}.", ""]
     lines += ["| number | paper | ours | command |", "|---|---|---|---|"]
     rows = [(part, number) for part in PAPER_RUNS for number in part.numbers(contents.get(part.kind))]
     lines += [f"| {n.what} | {n.paper} | {n.ours or '(not run)'} | `{part.command}` |" for part, n in rows]

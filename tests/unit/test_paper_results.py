@@ -19,7 +19,14 @@ from escape_hw.runtime.sweep.result import analyse_sweep
 @pytest.fixture(scope="module")
 def sweep_run(tmp_path_factory):
     with RunFolder("razor-shwfs", "sweep", tmp_path_factory.mktemp("sweep") / "run") as folder:
-        head = {"schema": 1, "command": "sweep", "system": "razor-shwfs", "simulated": True, "seed": 1}
+        head = {
+            "schema": 1,
+            "command": "sweep",
+            "system": "razor-shwfs",
+            "simulated": True,
+            "seed": 1,
+            "git": "abc123",
+        }
         folder.write_result({**head, **sweep_document(analyse_sweep(SWEPT, synthetic_run(0.0), 0.01))})
     return folder.path
 
@@ -35,7 +42,7 @@ def test_without_runs_every_row_states_how_to_make_it(tmp_path):
 def test_a_sweep_fills_its_rows_and_draws_its_figures(tmp_path, sweep_run):
     runs = find_sweeps([sweep_run])
     assert list(runs) == ["sweep-shwfs"]
-    write_results(tmp_path, runs)
+    assert "Commit of the software: abc123." in write_results(tmp_path, runs).read_text()
     rows = json.loads((tmp_path / "results.json").read_text())["rows"]
     ours = {row["number"]: row["ours"] for row in rows if row["ours"]}
     assert ours["razor-shwfs: randomised trials"] == "80, 128 loops in all"
