@@ -147,7 +147,15 @@ def test_stopped_before_sprint_a_reproduction_keeps_no_escape_matrix(good):
     assert caught.value.partial.calibrations["DO-CRIME"].partial
 
 
-def test_ctrl_c_in_a_script(good):
+@pytest.fixture
+def default_interrupts():
+    """Python's handler of SIGINT, which a program started in the background does not have."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+def test_ctrl_c_in_a_script(good, default_interrupts):
     """Without any handler of our own: the runner turns SIGINT into an orderly stop."""
 
     presses: list[int] = []
