@@ -97,7 +97,7 @@ def test_the_pyramid_has_gains_by_mode():
         with pytest.raises(TooFewFrames, match="at least 50"):
             looked(bench, 1, 40, start=start)
     errors, pulls = errors_and_pulls(found, truth)
-    assert (np.abs(errors[:3]) < [8.0, 8.0, 0.2]).all()
+    assert (np.abs(errors[:3]) < [8.0, 8.0, 0.3]).all()
     assert (np.abs(pulls[:3]) < 3.5).all()
     assert found.gains.shape == found.gains_sigma.shape == (20,)
     assert (found.gains_sigma < 0.15 * found.gains).all()
