@@ -28,7 +28,7 @@ def _calibrate(number: int, frames: int, *more: str) -> tuple[np.ndarray, Calibr
 
 @pytest.fixture(scope="module")
 def fifty() -> list[tuple[np.ndarray, CalibrationResult]]:
-    return [_calibrate(number, 50) for number in (0, 1)]
+    return [_calibrate(number, 50, *GAUSSIAN_TWIN) for number in (0, 1)]
 
 
 def test_a_tenth_of_a_second_meets_the_goal_on_every_realisation(fifty):
