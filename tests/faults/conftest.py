@@ -28,7 +28,8 @@ def _quick_benches() -> Iterator[None]:
         key = (pixels, pixel_m, r0_m, outer_m, str(rng.bit_generator.state))
         if key not in plates:
             plates[key] = von_karman_screen(pixels, pixel_m, r0_m, outer_m, rng)
-        return plates[key]
+        # The caller scales it in place.
+        return plates[key].copy()
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("escape_sim.atmosphere.phase_plates.von_karman_screen", remembered)
