@@ -49,7 +49,7 @@ def format_utc(moment: datetime | None = None) -> str:
 
 
 def format_local_time(at_utc: str) -> str:
-    """Local time of day of a time as FITS writes it; a text in another format as it is."""
+    """Local time of day of a UTC time as FITS writes it; any other text is returned unchanged."""
     try:
         moment = datetime.strptime(at_utc.partition(".")[0], "%Y-%m-%dT%H:%M:%S")
     except ValueError:

@@ -96,13 +96,18 @@ def test_a_matrix_is_chosen_with_the_keyboard(
     qtbot.waitUntil(lambda: control.asked == [("set_loop", {"matrix": "docrime"})])
 
 
-def test_the_result_stays_until_the_next_edit(
-    typist: Typist, loop: LoopPanel, control: ScriptedControl, qtbot: QtBot
-) -> None:
+def apply_leak(typist: Typist, loop: LoopPanel, qtbot: QtBot) -> None:
+    """Type a leak of 0.05, check and apply it."""
     typist.type(loop.leak, "0.05")
     loop.check()
     loop.apply()
     qtbot.waitUntil(lambda: "Applied" in loop.message.text())
+
+
+def test_the_result_stays_until_the_next_edit(
+    typist: Typist, loop: LoopPanel, control: ScriptedControl, qtbot: QtBot
+) -> None:
+    apply_leak(typist, loop, qtbot)
     for _ in range(3):
         typist.new_state(leak=0.05)
     assert "Applied" in loop.message.text()
@@ -114,10 +119,7 @@ def test_the_result_stays_until_the_next_edit(
 def test_the_result_goes_when_the_loop_is_opened(
     typist: Typist, loop: LoopPanel, control: ScriptedControl, qtbot: QtBot
 ) -> None:
-    typist.type(loop.leak, "0.05")
-    loop.check()
-    loop.apply()
-    qtbot.waitUntil(lambda: "Applied" in loop.message.text())
+    apply_leak(typist, loop, qtbot)
     # A further key reverts nothing.
     assert loop.window().focusWidget() is loop.check_button
     typist.new_state(closed=False)
