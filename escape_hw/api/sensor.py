@@ -13,10 +13,6 @@ from escape_hw.api.representation import short_repr
 from escape_hw.deprecation import renamed_members
 from escape_hw.errors import IncompatibleProduct
 
-#: Ratio of the rms spot motion and blur to the rms of the centres of gravity, which the window, the
-#: threshold and the turbulence within a lenslet reduce. Measured on a twin with known optics.
-SPOT_MOTION_FACTOR = 1.2
-
 
 @renamed_members(with_motion="with_slope_statistics", short_look="short_run_note")
 class SensorGeometry(abc.ABC):
@@ -70,6 +66,10 @@ class SensorGeometry(abc.ABC):
         """The geometry with this background level."""
         return replace(self, background=counts)  # type: ignore[type-var]  # a dataclass
 
+    def with_pixel_noise(self, counts: float) -> Self:
+        """The geometry with the rms noise of a pixel without light, if a model needs it; by default not."""
+        return self
+
     @abc.abstractmethod
     def outlines(self) -> tuple[tuple[float, float, float], ...]:
         """Outlines of sub-apertures or pupil images on the camera: (x, y, half width) in pixels each."""
@@ -91,6 +91,16 @@ class SensorGeometry(abc.ABC):
         persistent_fraction
             Fraction of the slope variance that is correlated over two frames; 0 if unknown.
         """
+
+    def with_temporal_response(self, weights: NDArray[np.float64]) -> Self:
+        """The geometry with what a model needs of the temporal response; by default nothing.
+
+        Parameters
+        ----------
+        weights
+            Share of the final response in each frame after a command ``(lags,)``, of sum 1.
+        """
+        return self
 
     @abc.abstractmethod
     def with_mean_slopes(self, mean: NDArray[np.float64]) -> Self:
@@ -164,6 +174,10 @@ class SubApertureGrid(SensorGeometry):
         turbulence and not to pokes; rms per axis in pixels, 0 if unknown.
     pokes
         Rms surface of the random pokes, all modes, as fraction of full stroke; 0 without random pokes.
+    pixel_noise
+        Rms noise of a pixel without light in one frame, in counts; 0 if unknown.
+    previous_share
+        Share of an exposure that sees the previous random poke instead of the present one; 0 if unknown.
     """
 
     kind: ClassVar[str] = "shack-hartmann"
@@ -184,6 +198,8 @@ class SubApertureGrid(SensorGeometry):
     background: float = 0.0
     turbulence_px: float = 0.0
     pokes: float = 0.0
+    pixel_noise: float = 0.0
+    previous_share: float = 0.0
     __repr__ = short_repr
 
     def centres_px(self) -> NDArray[np.float64]:
@@ -193,6 +209,10 @@ class SubApertureGrid(SensorGeometry):
             [self.origin_px[0] + columns * self.pitch_px, self.origin_px[1] + rows * self.pitch_px], axis=1
         )
 
+    def with_pixel_noise(self, counts: float) -> SubApertureGrid:
+        """See :meth:`SensorGeometry.with_pixel_noise`."""
+        return replace(self, pixel_noise=counts)
+
     def outlines(self) -> tuple[tuple[float, float, float], ...]:
         """See :meth:`SensorGeometry.outlines`."""
         return tuple((float(x), float(y), self.pitch_px / 2) for x, y in self.centres_px())
@@ -200,17 +220,22 @@ class SubApertureGrid(SensorGeometry):
     def with_slope_statistics(
         self, rms: float, pokes: float = 0.0, n_effective: float = 0.0, persistent_fraction: float = 0.0
     ) -> SubApertureGrid:
-        """See :meth:`SensorGeometry.with_slope_statistics`; applies :data:`SPOT_MOTION_FACTOR`.
+        """See :meth:`SensorGeometry.with_slope_statistics`.
 
         Without a ``persistent_fraction``, as in closed loop, ``turbulence_px`` is kept: the loop removes the
         motion of the spots but not the turbulence within a lenslet.
         """
-        turbulence = (
-            SPOT_MOTION_FACTOR * rms * float(np.sqrt(persistent_fraction))
-            if persistent_fraction
-            else self.turbulence_px
-        )
-        return replace(self, motion_px=SPOT_MOTION_FACTOR * rms, turbulence_px=turbulence, pokes=pokes)
+        turbulence = rms * float(np.sqrt(persistent_fraction)) if persistent_fraction else self.turbulence_px
+        return replace(self, motion_px=rms, turbulence_px=turbulence, pokes=pokes)
+
+    def with_temporal_response(self, weights: NDArray[np.float64]) -> SubApertureGrid:
+        """See :meth:`SensorGeometry.with_temporal_response`.
+
+        Two pokes in an exposure, of which each frame has a new one, have the variance ``(1 - q)^2 + q^2``
+        that the weights of all lags give.
+        """
+        variance = min(1.0, max(0.5, float(np.square(weights).sum())))
+        return replace(self, previous_share=(1 - float(np.sqrt(2 * variance - 1))) / 2)
 
     def with_mean_slopes(self, mean: NDArray[np.float64]) -> SubApertureGrid:
         """See :meth:`SensorGeometry.with_mean_slopes`; fits a regular lattice to the mean spots.

@@ -23,6 +23,7 @@ from escape_hw.pipeline.geometry.obscuration import build_shadow
 from escape_hw.pipeline.geometry.pupil_images import find_pupil_images, refine_pupil_images
 from escape_hw.pipeline.slopes.pyramid import PyramidSlopes
 from escape_hw.pipeline.slopes.shack_hartmann import ShackHartmannSlopes
+from escape_hw.pipeline.statistics import root_mean_square
 
 #: Pixels over which a frame is smoothed to find its dark parts.
 _SMOOTHING_PX = 9
@@ -155,15 +156,14 @@ def get_sensor_kind(bench: Bench) -> _Pyramid | _ShackHartmann:
     return _Pyramid(section) if isinstance(section, PyramidSection) else _ShackHartmann(section)
 
 
-def _estimate_dark_level(mean_frame: NDArray[np.float32]) -> float:
-    """Level of the pixels without light, in counts: median of the darkest fifth of a smoothed frame.
+def _find_darkest_pixels(mean_frame: NDArray[np.float32]) -> NDArray[np.intp]:
+    """Flat indices of the pixels without light: the darkest fifth of a smoothed frame.
 
     These are the pixels outside the pupil, without the wings of bright spots. Smoothing makes the choice of
     the darkest independent of the fixed pattern, which would otherwise lower the level.
     """
     smooth = ndimage.uniform_filter(mean_frame.astype(np.float32), _SMOOTHING_PX)
-    darkest = mean_frame.ravel()[np.argsort(smooth.ravel())[: max(1, mean_frame.size // 5)]]
-    return float(np.median(darkest))
+    return np.argsort(smooth.ravel())[: max(1, mean_frame.size // 5)]
 
 
 def _region_message(what: str, shape: tuple[int, int]) -> str:
@@ -194,7 +194,11 @@ def prepare_sensor(bench: Bench) -> None:
 
 
 def build_sensor_setup(
-    bench: Bench, mean_frame: NDArray[np.float32], references: str = "design"
+    bench: Bench,
+    mean_frame: NDArray[np.float32],
+    references: str = "design",
+    *,
+    frame: NDArray[np.uint16] | None = None,
 ) -> SensorSetup:
     """Find the sensor's geometry on a mean frame.
 
@@ -205,15 +209,20 @@ def build_sensor_setup(
         background is estimated from the darkest pixels.
     mean_frame
         Mean of raw frames in counts ``(rows, columns)``.
+    frame
+        One of these frames, from which the noise of the pixels is estimated.
 
     Raises
     ------
     CalibrationError
         No spots or pupil images where the design has them.
     """
-    background = _estimate_dark_level(mean_frame) if bench.dark is None else 0.0
+    darkest = _find_darkest_pixels(mean_frame)
+    background = float(np.median(mean_frame.ravel()[darkest])) if bench.dark is None else 0.0
     calibrated = _calibrate_frame(bench, mean_frame, background)
     grid = get_sensor_kind(bench).find(bench, calibrated, references)
+    if frame is not None:
+        grid = grid.with_pixel_noise(root_mean_square((frame - mean_frame).ravel()[darkest]))
     return SensorSetup(grid.with_background(background), mean_frame)
 
 
@@ -281,17 +290,22 @@ def find_sensor(
     """
     validate_frame_count(frames)
     prepare_sensor(bench)
-    mean = yield from _average_frames(bench, frames, f"find the {get_sensor_kind(bench).search_target}")
-    return build_sensor_setup(bench, mean, references)
+    stage = f"find the {get_sensor_kind(bench).search_target}"
+    mean, last = yield from _average_frames(bench, frames, stage)
+    return build_sensor_setup(bench, mean, references, frame=last)
 
 
-def _average_frames(bench: Bench, frames: int, stage: str) -> Procedure[NDArray[np.float32]]:
+def _average_frames(
+    bench: Bench, frames: int, stage: str
+) -> Procedure[tuple[NDArray[np.float32], NDArray[np.uint16]]]:
+    """Mean and last of a number of frames."""
     total, report = np.zeros((), np.float64), Reporter(stage, frames)
     for done in range(frames):
-        total = total + next_frame(bench).data
+        data = next_frame(bench).data
+        total = total + data
         if report.is_due():
             yield report(done + 1)
-    return (total / frames).astype(np.float32)
+    return (total / frames).astype(np.float32), data
 
 
 def ensure_sensor_ready(
@@ -344,7 +358,7 @@ def measure_dark(
     """
     validate_frame_count(frames)
     if blocked_by_hand:
-        bench.dark = yield from _average_frames(bench, frames, "dark frame")
+        bench.dark, _ = yield from _average_frames(bench, frames, "dark frame")
         return bench.dark
     if bench.screen is None:
         raise CalibrationError(
@@ -357,7 +371,7 @@ def measure_dark(
         for _ in range(3):
             # Frames whose exposure began before the beam was blocked.
             next_frame(bench)
-        bench.dark = yield from _average_frames(bench, frames, "dark frame")
+        bench.dark, _ = yield from _average_frames(bench, frames, "dark frame")
     finally:
         bench.screen.set(blocked=before)
     return bench.dark
@@ -408,6 +422,6 @@ def measure_flat(bench: Bench, *, frames: int = 100) -> Procedure[NDArray[np.flo
     validate_frame_count(frames)
     if bench.dark is None:
         raise CalibrationError("there is no dark frame; measure it first")
-    mean = yield from _average_frames(bench, frames, "flat")
+    mean, _ = yield from _average_frames(bench, frames, "flat")
     bench.flat = compute_flat(mean, bench.dark)
     return bench.flat

@@ -213,7 +213,7 @@ class OpenLoopAcquisition:
             for frame, _ in self._pending_frames:
                 total += frame.data
             mean = (total / len(self._pending_frames)).astype(np.float32)
-            setup = build_sensor_setup(self.bench, mean)
+            setup = build_sensor_setup(self.bench, mean, frame=self._pending_frames[-1][0].data)
             self._sensor = self._set_up_sensor(setup.grid, setup.mean_frame)
         else:
             self._sensor = self._set_up_sensor(self._grid, None)

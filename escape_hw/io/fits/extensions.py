@@ -32,7 +32,8 @@ _COMMON_CARDS = {"COUNTS": "counts", "BACKGND": "background"}
 #: not write have a default there.
 _CARDS: dict[str, dict[str, str]] = {
     SubApertureGrid.kind: {
-        "PITCH": "pitch_px", "MOTION": "motion_px", "AIR": "turbulence_px", "POKES": "pokes", **_COMMON_CARDS,
+        "PITCH": "pitch_px", "MOTION": "motion_px", "AIR": "turbulence_px", "POKES": "pokes",
+        "NOISE": "pixel_noise", "PREVIOUS": "previous_share", **_COMMON_CARDS,
     },
     PyramidPupils.kind: {
         "DIAMETER": "diameter_px", "MOTION": "motion", "CENTRESD": "centre_sigma_px", "POKES": "pokes",
