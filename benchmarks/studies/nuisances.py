@@ -7,9 +7,9 @@ Each imperfection of :data:`CASES` is drawn from the distribution stated there, 
 realisation as seed, and the realisation is calibrated with it and without any of them: the same mirror,
 registration, turbulence and noise. Realisations from 2000 on are for this study. Appends a line per
 realisation to ``SYSTEM-CASE.jsonl``, and measures what is missing. Prints a table: rms change of each
-parameter, in its unit and in stated standard errors, from the realisations that converged with and without;
-how many did; mean reduced chi-squared without and with. A calibration takes 10 s (razor-shwfs) or 70 s
-(razor-pywfs) of a core.
+parameter, in its unit and in stated standard errors, and the largest one, from the realisations that
+converged with and without; rms and largest error in stated errors; number of those that converged; mean
+reduced chi-squared. A calibration takes 10 s (razor-shwfs) or 70 s (razor-pywfs) of a core.
 """
 
 from __future__ import annotations
@@ -182,34 +182,31 @@ def measure(system: str, name: str | None, number: int, frames: int) -> Line:
 def print_table(rows: Mapping[str, list[Line]], reference: list[Line]) -> None:
     """Markdown of the changes by imperfection."""
     names = ("shift x [%]", "shift y [%]", "rotation [deg]", "radial [%]", "tangential [%]")
-    print(f"| imperfection | {' | '.join(names)} | largest | converged | chi-squared |")
-    print("|---|" + "---:|" * (len(names) + 3))
+    print(f"| imperfection | {' | '.join(names)} | largest | error | converged | chi-squared |")
+    print("|---|" + "---:|" * (len(names) + 4))
     without = {line["realisation"]: line for line in reference}
+    print(f"| none | {' | '.join(['–'] * 6)} | {_outcome(reference)} |")
     for name, lines in rows.items():
-        pairs = [(without[line["realisation"]], line) for line in lines if line["realisation"] in without]
-        both = [pair for pair in pairs if pair[0]["converged"] and pair[1]["converged"]]
+        pairs = [(without[line["realisation"]], line) for line in lines]
+        both = [(zero, one) for zero, one in pairs if zero["converged"] and one["converged"]]
         cells, largest = ["–"] * 5, "–"
         if both:
             changes = np.array([np.subtract(one["error"], zero["error"]) for zero, one in both])
             in_sigmas = changes / np.array([one["sigma"] for _, one in both])
             cells = [f"{rms(c):.2g} ({rms(s):.2f} σ)" for c, s in zip(changes.T, in_sigmas.T, strict=True)]
             largest = f"{np.abs(in_sigmas).max():.1f} σ"
-        chi2 = [np.mean([pair[k]["chi2"] for pair in pairs]) for k in (0, 1)]
-        converged = f"{sum(line['converged'] for _, line in pairs)} of {len(pairs)}"
-        print(f"| {name} | {' | '.join(cells)} | {largest} | {converged} | {chi2[0]:.2f}, {chi2[1]:.2f} |")
-    ended = [line["converged"] for line in reference]
-    errors = np.array([np.divide(line["error"], line["sigma"]) for line in reference if line["converged"]])
-    print(f"\nWithout any of them {sum(ended)} of {len(ended)} converged", end="")
-    print(f"; rms error {rms(errors):.2f} σ." if len(errors) else ".")
-    print_warnings(rows)
-
-
-def print_warnings(rows: Mapping[str, list[Line]]) -> None:
-    """List the realisations that warned."""
+        print(f"| {name} | {' | '.join(cells)} | {largest} | {_outcome(lines)} |")
     for name, lines in rows.items():
         for line in lines:
             for warning in line["warnings"]:
-                print(f"{name}, realisation {line['realisation']}: {warning}")
+                print(f"\n{name}, realisation {line['realisation']}: {warning}")
+
+
+def _outcome(lines: Sequence[Line]) -> str:
+    """Rms and largest error in stated errors, number of the converged realisations, mean chi-squared."""
+    errors = np.array([np.divide(line["error"], line["sigma"]) for line in lines if line["converged"]])
+    error = f"{rms(errors):.2f}, {np.abs(errors).max():.1f} σ" if len(errors) else "–"
+    return f"{error} | {len(errors)} of {len(lines)} | {np.mean([line['chi2'] for line in lines]):.2f}"
 
 
 def print_distributions(names: Sequence[str]) -> None:
