@@ -369,7 +369,9 @@ class ScreenConfig(DeviceConfig):
     speed_m_s: float = Field(
         ge=0, le=100, description="speed of the screen across the pupil, metres per second"
     )
-    outer_scale_m: float = Field(gt=0, le=1000, description="outer scale of the turbulence, metres")
+    outer_scale_m: float = Field(
+        gt=0, le=1000, description="outer scale of the turbulence in the twin, metres"
+    )
 
     @model_validator(mode="after")
     def _rules(self) -> Self:

@@ -25,6 +25,8 @@ from escape_hw.errors import ConfigError
 
 #: Fewest pixels across a sub-aperture, those of a quad cell.
 _MIN_SPOT_PX = 2
+#: Largest relative difference of the twin's pupil images from their nominal diameter.
+_DIAMETER_RANGE = 0.1
 
 
 class TelescopeSection(Section):
@@ -301,6 +303,13 @@ class SystemConfig(Section):
             text = f"is too small for {n_sub} sub-apertures; needs at least {least} x {least} pixels"
             yield RuleViolation("devices.wfs.region", list(region), text)
 
+    def _lenslet_rules(self) -> Iterator[RuleViolation]:
+        """OOPAO's lenslets form a square grid along the pixels."""
+        for key in ("clocking_deg", "distortion"):
+            value = getattr(self.twin.wfs, key)
+            if value and self.system.optics != "fast":
+                yield RuleViolation(f"twin.wfs.{key}", value, "needs system.optics = 'fast'")
+
     def _sensor_rules(self) -> Iterator[RuleViolation]:
         """Rules between the sensor and the other sections."""
         twin = self.twin
@@ -309,6 +318,7 @@ class SystemConfig(Section):
             for key, value in twin.pyramid.model_dump(exclude_defaults=True).items():
                 yield RuleViolation(f"twin.pyramid.{key}", value, text)
             yield from self._region_rules(self.sensor.n_sub)
+            yield from self._lenslet_rules()
             return
         modulator, radius = self.devices.modulator, self.sensor.modulation
         if radius and modulator is None:
@@ -329,6 +339,13 @@ class SystemConfig(Section):
             n = self.sensor.n_sub
             text = f"the region of {width} x {height} pixels cuts off part of this image of {n} pixels"
             yield RuleViolation("sensor.pupils_px", centre, text)
+        true_px = twin.pyramid.diameter_px
+        if true_px is not None and abs(true_px / self.sensor.n_sub - 1) > _DIAMETER_RANGE:
+            text = f"differs from sensor.n_sub = {self.sensor.n_sub} by more than {_DIAMETER_RANGE:.0%}"
+            yield RuleViolation("twin.pyramid.diameter_px", true_px, text)
+        for key in ("clocking_deg", "distortion"):
+            if value := getattr(twin.wfs, key):
+                yield RuleViolation(f"twin.wfs.{key}", value, "applies to lenslets; remove it")
         moved = "applies to lenslets; use twin.pyramid.centre_offsets_px to move pupil images"
         if twin.wfs.pitch_px is not None:
             yield RuleViolation("twin.wfs.pitch_px", twin.wfs.pitch_px, moved)

@@ -193,6 +193,13 @@ class TwinMirror(Section):
     coupling: float | None = Field(
         None, ge=0.01, le=0.9, description="true coupling, fraction; absent: as devices.dm.coupling"
     )
+    stroke_m: float | None = Field(
+        None,
+        gt=0,
+        le=1e-3,
+        description="true metres of surface at the actuator for a command of 1; absent: as "
+        "devices.dm.stroke_m",
+    )
     width_scatter: float = Field(
         0.0, ge=0, le=0.5, description="scatter of the widths of the influence functions, rms fraction"
     )
@@ -259,9 +266,37 @@ class TwinSensor(TwinCamera):
     pitch_px: float | None = Field(
         None, ge=2, le=1000, description="true lenslet pitch, pixels; absent: as sensor.pitch_px"
     )
+    clocking_deg: float = Field(
+        0.0,
+        ge=-10,
+        le=10,
+        description="rotation on the camera of the lenslet grid and of the motions of its spots, degrees "
+        "from +x towards +y",
+    )
+    distortion: float = Field(
+        0.0,
+        ge=-0.05,
+        le=0.05,
+        description="radial distortion of the lenslet grid about its centre, proportional to the cube of the "
+        "distance: displacement of a spot at half the width of the grid, fraction of that distance",
+    )
 
 
 Offset = TomlArray[tuple[Annotated[float, Field(ge=-20, le=20)], Annotated[float, Field(ge=-20, le=20)]]]
+
+
+class TwinBeam(Section):
+    """True Gaussian illumination of the pupil; the pupil itself stays where it is."""
+
+    radius_m: Annotated[float, Field(allow_inf_nan=True)] | None = Field(
+        None,
+        gt=0,
+        description="true 1/e^2 intensity radius of the beam, metres; inf: uniform; absent: as "
+        "sensor.beam_radius_m",
+    )
+    centre_m: TomlArray[
+        tuple[Annotated[float, Field(ge=-100, le=100)], Annotated[float, Field(ge=-100, le=100)]]
+    ] = Field((0.0, 0.0), description="centre of the beam from that of the pupil, (x, y) in metres")
 
 
 class TwinPyramid(Section):
@@ -271,11 +306,24 @@ class TwinPyramid(Section):
         ((0.0, 0.0), (0.0, 0.0), (0.0, 0.0), (0.0, 0.0)),
         description="offset of each pupil image from sensor.pupils_px, (x, y) in pixels",
     )
+    diameter_px: float | None = Field(
+        None, ge=4, le=440, description="true diameter of a pupil image, pixels; absent: as sensor.n_sub"
+    )
     rooftop: float = Field(
         0.0, ge=0, le=5, description="length of the roof edge at the tip of the pyramid, lambda/D"
     )
+    radius_error: float = Field(
+        0.0,
+        ge=-0.5,
+        le=0.5,
+        description="relative error of the modulation radius: motion of the beam per tilt of the modulator, "
+        "fraction",
+    )
     ellipse: float = Field(
         0.0, ge=-0.5, le=0.5, description="relative difference of the modulation radii in x and y, fraction"
+    )
+    ellipse_angle_deg: float = Field(
+        0.0, ge=-180, le=180, description="rotation of the axes of the ellipse, degrees from +x towards +y"
     )
     phase: float = Field(
         0.0, ge=-60, le=60, description="error of the 90 degree phase between the modulation axes, degrees"
@@ -316,7 +364,13 @@ class TwinNcpa(Section):
 class TwinConfig(Section):
     """The simulated bench."""
 
-    substeps: int = Field(2, ge=1, le=50, description="simulated steps of the mirror motion per exposure")
+    substeps: int = Field(
+        2,
+        ge=1,
+        le=50,
+        description="images that are averaged in an exposure, each with the turbulence of its middle and the "
+        "mean position of the mirror; 1: the exposure does not blur the turbulence",
+    )
     run_seed: int | None = Field(
         None,
         ge=0,
@@ -341,6 +395,7 @@ class TwinConfig(Section):
     science: TwinCamera = Field(
         default_factory=TwinCamera, description="signal and noise of the science camera"
     )
+    beam: TwinBeam = Field(default_factory=TwinBeam, description="true illumination of the pupil")
     pyramid: TwinPyramid = Field(
         default_factory=TwinPyramid, description="imperfections of a pyramid and its modulator"
     )

@@ -18,6 +18,7 @@ HIDDEN = (
     "twin.wfs.photons_per_frame=1e4", "twin.wfs.read_noise_e=50", "twin.wfs.fixed_pattern=0.1",
     "twin.vibration.amplitude_rad=[1e-4,1e-4]", "twin.ncpa.rms_m=2e-7", "twin.latency_s=2e-3",
     "twin.loss_probability=0.2", "twin.contamination.edge_share=0.2", "system.seed=99",
+    "twin.mirror.stroke_m=2.4e-6", "twin.beam.radius_m=4e-3", "twin.beam.centre_m=[3e-4,-2e-4]",
 )  # fmt: skip
 LENSLETS = (
     "sensor.n_sub=12", "devices.wfs.region=[220,156,200,200]", 'devices.dm.layout="circle-7"',
@@ -26,9 +27,15 @@ LENSLETS = (
 PYRAMID = ('devices.dm.layout="circle-7"', "devices.dm.pitches_across_pupil=5.0", "basis.n_modes=20")
 PYRAMID = (*PYRAMID, "loop.dropped_modes=0", "sensor.modulation=2.0")
 SENSORS = {
-    "lenslets": ("razor-shwfs", LENSLETS, ("twin.wfs.pitch_px=15.7", "twin.wfs.grid_offset_px=[5.0,-4.0]")),
-    "pyramid": ("razor-pywfs", PYRAMID, ("twin.pyramid.rooftop=1.0", "twin.pyramid.ellipse=0.2")),
-}
+    "lenslets": ("razor-shwfs", LENSLETS, (
+        "twin.wfs.pitch_px=15.7", "twin.wfs.grid_offset_px=[5.0,-4.0]", "twin.wfs.clocking_deg=0.5",
+        "twin.wfs.distortion=0.002",
+    )),
+    "pyramid": ("razor-pywfs", PYRAMID, (
+        "twin.pyramid.rooftop=1.0", "twin.pyramid.ellipse=0.2", "twin.pyramid.ellipse_angle_deg=30.0",
+        "twin.pyramid.radius_error=0.1", "twin.pyramid.diameter_px=64.6",
+    )),
+}  # fmt: skip
 SOMEWHERE = Registration(-16.0, 31.0, -0.77, 2.9, 0.5)
 
 

@@ -30,7 +30,7 @@ from escape_sim.optics.base import ModulatedOptics, SensorOptics
 from escape_sim.optics.detector import Detector
 from escape_sim.optics.focal_plane import FocalPlane
 from escape_sim.optics.modulation import BeamPath
-from escape_sim.optics.pupil import contaminated_pupil, pupil_geometry
+from escape_sim.optics.pupil import contaminated_pupil, true_diameter, true_pupil
 from escape_sim.optics.sensor import make_sensor_optics
 
 if TYPE_CHECKING:
@@ -75,9 +75,9 @@ class SimBench:
         self.latency_rng, self.frame_rng = np.random.default_rng(latency), np.random.default_rng(frames)
         truth = np.random.default_rng(truth_seed)
         self.pupil = contaminated_pupil(config, np.random.default_rng(contamination_seed))
-        design_light = np.square(pupil_geometry(config).amplitude, dtype=float).sum()
+        clean_light = np.square(true_pupil(config).amplitude, dtype=float).sum()
         # Share of the light that the contaminated pupil transmits.
-        self._throughput = float(np.square(self.pupil.amplitude, dtype=float).sum() / design_light)
+        self._throughput = float(np.square(self.pupil.amplitude, dtype=float).sum() / clean_light)
         self._clock_ns = 0
         self._wall_start = time.monotonic()
         dm, twin = config.devices.dm, config.twin
@@ -90,7 +90,7 @@ class SimBench:
             self.influence.n_act, twin.mirror.settling_s, twin.mirror.creep_fraction, twin.mirror.creep_time_s
         )
         # A reflection changes the path by twice the surface.
-        self._opd_per_command_m = np.float32(2 * dm.stroke_m)
+        self._opd_per_command_m = np.float32(2 * (twin.mirror.stroke_m or dm.stroke_m))
         self._ncpa = self._make_aberration(truth, twin.ncpa.rms_m, twin.ncpa.n_modes)
         self._vibration_phase = truth.uniform(0, 2 * np.pi, (2, len(twin.vibration.frequency_hz)))
         self._sensor: SensorOptics | None = None
@@ -233,7 +233,7 @@ class SimBench:
 
     def focal_plane(self, shape: tuple[int, int]) -> FocalPlane:
         """Optics of the science camera for a region."""
-        diameter_px = self.pupil.n_sub * self.pupil.n_pix
+        diameter_px = true_diameter(self.config) * self.pupil.n_pix
         wavelength_m, psf_px = self.config.system.wavelength_m, self.science_section.psf_px
         return FocalPlane(self.pupil.amplitude, diameter_px, wavelength_m, psf_px, shape)
 

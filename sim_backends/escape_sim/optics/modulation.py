@@ -118,6 +118,11 @@ class BeamPath:
 
     def points(self) -> ModulationPath:
         """Modulation path of the beam in lambda/D, without the drift of its centre."""
+        path, error = self._path_of_tilts(), self._config.twin.pyramid.radius_error
+        return ModulationPath(path.points * (1 + error)) if error else path
+
+    def _path_of_tilts(self) -> ModulationPath:
+        """Path in lambda/D if the beam moves by ``devices.modulator.rad_per_lambda_d``."""
         if self._emulated is not None:
             return self._points_of_emulated_stage(*self._emulated)
         modulator, commanded = self._config.devices.modulator, self.modulation
@@ -128,7 +133,16 @@ class BeamPath:
         n = n_points(radius)
         angle, lag = 2 * np.pi * np.arange(n) / n, math.radians(twin.phase)
         circle = np.stack([np.cos(angle), np.sin(angle + lag)], axis=1) * radius
-        circle *= 1 + np.array([twin.ellipse, -twin.ellipse]) / 2
+        axes = 1 + np.array([twin.ellipse, -twin.ellipse]) / 2
+        if twin.ellipse_angle_deg:
+            c, s = (
+                math.cos(math.radians(twin.ellipse_angle_deg)),
+                math.sin(math.radians(twin.ellipse_angle_deg)),
+            )
+            turn = np.array([[c, -s], [s, c]])
+            circle = circle @ (turn * axes @ turn.T)
+        else:
+            circle *= axes
         return ModulationPath(circle + np.divide(commanded.centre_rad, modulator.rad_per_lambda_d))
 
     def _points_of_emulated_stage(self, read_cycle: _CycleReader, to_tilt: _TiltConverter) -> ModulationPath:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from escape_hw.config.twin import TwinBeam
 from escape_hw.errors import CalibrationError
 from escape_hw.pipeline.geometry.obscuration import transmitted_fraction
 from escape_hw.pipeline.geometry.pupil_rims import RIM_SOFTNESS
@@ -80,7 +81,7 @@ _MIN_TRANSMISSION = 1e-3
 class PupilGeometry:
     """Sampled pupil of a system."""
 
-    #: Sub-apertures across the pupil, and samples across each of them.
+    #: Sub-apertures across the grid, and samples across each of them.
     n_sub: int
     n_pix: int
     sub_aperture_m: float
@@ -105,13 +106,39 @@ def pupil_geometry(config: SystemConfig, n_pix: int | None = None) -> PupilGeome
 
     ``n_pix`` is the number of samples across a sub-aperture, by default :func:`default_samples`.
     """
-    n_pix = n_pix or default_samples(config)
+    return _sampled_pupil(config, n_pix or default_samples(config), TwinBeam(), None)
+
+
+def true_pupil(config: SystemConfig) -> PupilGeometry:
+    """Pupil of the twin, with the true beam and size of the pupil images, without contamination.
+
+    The sub-aperture of a pyramid is a camera pixel. Where the images have another diameter than the nominal
+    one, ``n_sub`` pixels are at least as wide.
+    """
+    return _sampled_pupil(config, default_samples(config), config.twin.beam, config.twin.pyramid.diameter_px)
+
+
+def true_diameter(config: SystemConfig) -> float:
+    """True diameter of the pupil in sub-apertures; for a pyramid, that of its images in pixels."""
+    return float(config.twin.pyramid.diameter_px or config.sensor.n_sub)
+
+
+def _sampled_pupil(
+    config: SystemConfig, n_pix: int, beam: TwinBeam, diameter_px: float | None
+) -> PupilGeometry:
+    """Round pupil with a Gaussian beam; ``diameter_px`` sub-apertures across, by default ``sensor.n_sub``."""
     n_sub, diameter = config.sensor.n_sub, config.system.pupil_m
-    d = diameter / n_sub
+    if diameter_px is not None:
+        n_sub = 2 * math.ceil(diameter_px / 2)
+    d = diameter / (diameter_px or n_sub)
     n = n_sub * n_pix
     x = (np.arange(n) - (n - 1) / 2) * d / n_pix
     r2 = x[:, None] ** 2 + x[None, :] ** 2
-    amplitude = np.where(r2 <= (diameter / 2) ** 2, np.exp(-r2 / config.sensor.beam_radius_m**2), 0.0)
+    beam_r2 = r2
+    if any(beam.centre_m):
+        beam_r2 = (x[:, None] - beam.centre_m[1]) ** 2 + (x[None, :] - beam.centre_m[0]) ** 2
+    radius = beam.radius_m or config.sensor.beam_radius_m
+    amplitude = np.where(r2 <= (diameter / 2) ** 2, np.exp(-beam_r2 / radius**2), 0.0)
     if config.telescope.obscuration or config.telescope.spiders_deg:
         # A partly covered sample keeps that share of the light, not of the amplitude.
         amplitude *= np.sqrt(transmitted_fraction(config.telescope, diameter, x))
@@ -182,6 +209,6 @@ def default_samples(config: SystemConfig) -> int:
 
 def contaminated_pupil(config: SystemConfig, rng: np.random.Generator) -> PupilGeometry:
     """True pupil of the twin, with ``twin.contamination``."""
-    pupil, contamination = pupil_geometry(config), config.twin.contamination
+    pupil, contamination = true_pupil(config), config.twin.contamination
     share = pupil_transmission(contamination, config.system.pupil_m, pupil.coordinates_m, rng)
     return replace(pupil, amplitude=(pupil.amplitude * np.sqrt(share)).astype(np.float32))

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from escape_hw.config.sensor import PyramidSection
 from escape_sim.optics.base import SensorOptics
+from escape_sim.optics.distorted_lenslets import DistortedShackHartmannOptics
 from escape_sim.optics.modulation import ModulationPath
-from escape_sim.optics.pupil import PupilGeometry
+from escape_sim.optics.pupil import PupilGeometry, true_diameter
 from escape_sim.optics.pyramid import PyramidOptics
 from escape_sim.optics.shack_hartmann import LensletOptics, ShackHartmannOptics
 
@@ -36,7 +38,7 @@ def make_sensor_optics(config: SystemConfig, pupil: PupilGeometry) -> SensorOpti
     if isinstance(sensor, PyramidSection):
         twin = config.twin.pyramid
         return pyramid_class(
-            amplitude, float(pupil.n_sub), wavelength_m, np.add(sensor.pupils_px, twin.centre_offsets_px),
+            amplitude, true_diameter(config), wavelength_m, np.add(sensor.pupils_px, twin.centre_offsets_px),
             shape, ModulationPath.circle(0.0), rooftop=twin.rooftop, samples=pupil.n_pix,
         )  # fmt: skip
     pitch = config.twin.wfs.pitch_px or sensor.pitch_px
@@ -44,6 +46,10 @@ def make_sensor_optics(config: SystemConfig, pupil: PupilGeometry) -> SensorOpti
         (length - 1) / 2 - pitch * (sensor.n_sub - 1) / 2 + offset
         for length, offset in zip(shape[::-1], config.twin.wfs.grid_offset_px, strict=True)
     )
-    return lenslet_class(
-        sensor.n_sub, pupil.n_pix, wavelength_m, pitch, sensor.spot_px, (x, y), shape, amplitude
-    )
+    geometry = (sensor.n_sub, pupil.n_pix, wavelength_m, pitch, sensor.spot_px, (x, y), shape, amplitude)
+    true = config.twin.wfs
+    if true.clocking_deg or true.distortion:
+        return DistortedShackHartmannOptics(
+            *geometry, clocking=math.radians(true.clocking_deg), distortion=true.distortion
+        )
+    return lenslet_class(*geometry)
