@@ -293,6 +293,8 @@ class State(StateDocument):
     geometry_version: int = 0
     #: Number of the newest entry of the night log; -1 if there is none.
     last_night_entry: int = -1
+    #: Number of the newest line of the log; -1 if there is none.
+    last_log_line: int = -1
     clients: int = 0
     #: Seconds since a client had control; 0 while one has it, or if none ever had it.
     unattended_for_s: float = 0.0

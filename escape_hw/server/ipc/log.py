@@ -55,6 +55,8 @@ class ServerLog:
         path.parent.mkdir(parents=True, exist_ok=True)
         self._lines: deque[LogLine] = deque(maxlen=_LINES)
         self._next, self._publish = first_number, publish
+        #: Number of the newest line; -1 if there is none.
+        self.last_number = -1
         self._file = logging.handlers.RotatingFileHandler(
             path, maxBytes=_BYTES, backupCount=_FILES, encoding="utf-8"
         )
@@ -64,7 +66,7 @@ class ServerLog:
     def add(self, line: LogLine) -> None:
         """Add a line of this process or the engine."""
         line = line.model_copy(update={"number": self._next})
-        self._next += 1
+        self.last_number, self._next = self._next, self._next + 1
         self._lines.append(line)
         text = f"{line.at_utc} {line.level} {line.logger}: {line.text}"
         self._file.emit(logging.LogRecord(line.logger, logging.INFO, "", 0, text, None, None))
