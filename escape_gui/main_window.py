@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 
 from PySide6.QtCore import QByteArray, QPoint, QRect, QSize, Qt, QTimer
-from PySide6.QtGui import QAction, QCloseEvent, QKeySequence
+from PySide6.QtGui import QAction, QCloseEvent, QKeySequence, QResizeEvent
 from PySide6.QtWidgets import (
     QApplication,
     QDockWidget,
@@ -57,6 +57,9 @@ from escape_hw.remote.state import State
 log = logging.getLogger(__name__)
 #: Version of the dock arrangement that Qt stores; layouts of other versions are discarded.
 LAYOUT_VERSION = 4
+#: Least width and height of a window in which the panels are arranged as on a large screen, pixels at the
+#: normal size of the fonts.
+_LARGE_PX = (2000, 1050)
 #: Room that is left for the frame of the window manager.
 _FRAME = QSize(8, 32)
 #: Width of the coloured frame of a recorded run, and offset of its window, pixels.
@@ -127,6 +130,7 @@ class MainWindow(QMainWindow):
         self._may_close = False
         self.handlers = self._make_handlers()
         self.workspace = workspace(settings.workspace)
+        self._is_large = False
         self._restore()
 
     # ------------------------------------------------------------ construction
@@ -289,11 +293,12 @@ class MainWindow(QMainWindow):
         )
 
     def _apply_layout(self) -> None:
-        stored = self._settings.layouts.get(self.workspace.name)
+        self._is_large = self._fits_large_layout
+        stored = self._settings.layouts.get(self._layout_name)
         docks: dict[str, QDockWidget] = dict(self.docks)
         size = self.size()
         if stored is None or not self.restoreState(_bytes(stored), LAYOUT_VERSION):
-            arrange_docks(self, docks, self.workspace)
+            arrange_docks(self, docks, self.workspace.arranged(self._is_large))
         self.resize(size)
         arrange_tab_bars(self, docks)
         if self.isVisible() and not (self.isMaximized() or self.isFullScreen()):
@@ -301,6 +306,26 @@ class MainWindow(QMainWindow):
             QTimer.singleShot(0, self, lambda: self.resize(self.size().boundedTo(size)))
         # Docks that were shown again lie above everything else.
         self.overlay.raise_()
+
+    @property
+    def _fits_large_layout(self) -> bool:
+        least = QSize(*map(self.context.theme.pixels, _LARGE_PX))
+        return self.width() >= least.width() and self.height() >= least.height()
+
+    @property
+    def _layout_name(self) -> str:
+        """Name of the present layout in the settings; that of a large window is another one."""
+        return f"{self.workspace.name}-large" if self._is_large else self.workspace.name
+
+    def _change_layout(self) -> None:
+        """Arrange the panels anew when the window has become large, or is no longer."""
+        if self._fits_large_layout != self._is_large:
+            self._store_layout()
+            self._apply_layout()
+
+    def resizeEvent(self, event: QResizeEvent) -> None:
+        super().resizeEvent(event)
+        QTimer.singleShot(0, self, self._change_layout)
 
     def show_workspace(self, name: str) -> None:
         """Save the layout of this workspace and change to another one."""
@@ -314,11 +339,11 @@ class MainWindow(QMainWindow):
         self.setFocus()
 
     def reset_layout(self) -> None:
-        self._settings.layouts.pop(self.workspace.name, None)
+        self._settings.layouts.pop(self._layout_name, None)
         self._apply_layout()
 
     def _store_layout(self) -> None:
-        self._settings.layouts[self.workspace.name] = _text(self.saveState(LAYOUT_VERSION))
+        self._settings.layouts[self._layout_name] = _text(self.saveState(LAYOUT_VERSION))
 
     def focus_panel(self, step: int) -> None:
         """Move the focus by ``step`` visible panels."""

@@ -316,7 +316,7 @@ class Night:
         QTest.keyClicks(self.log.note, note)
         QTest.keyClick(self.log.note, Qt.Key.Key_Return)
         self.operator.until(lambda: note in self.log.text.toPlainText(), "the note is listed")
-        assert not self.log.note.text()
+        self.operator.until(lambda: not self.log.note.text(), "the field is cleared")
         self.images("night_log")
         with tempfile.TemporaryDirectory() as temporary:
             page = (self.folder or Path(temporary)) / "night.html"

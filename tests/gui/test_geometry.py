@@ -95,6 +95,47 @@ def test_the_layout_of_a_wide_screen_fits_a_narrow_one(show: Show) -> None:
     check(window, 1016, 736)
 
 
+def in_front(window: MainWindow) -> set[str]:
+    return {name for name, dock in window.docks.items() if not dock.visibleRegion().isEmpty()}
+
+
+@pytest.mark.parametrize(
+    ("workspace", "more"),
+    [("align", set()), ("calibrate", {"log", "camera", "gains"}), ("operate", {"log", "mirror", "trends"})],
+)
+def test_a_large_window_shows_more_panels_at_once(workspace: str, more: set[str], show: Show) -> None:
+    window = show(Settings(workspace=workspace))
+    window.resize(1280, 760)
+    QApplication.processEvents()
+    before = in_front(window)
+    window.resize(2560, 1400)
+    for _ in range(5):
+        QApplication.processEvents()
+    assert (window.width(), window.height()) == (2560, 1400)
+    assert in_front(window) == before | more
+    window.resize(1280, 760)
+    for _ in range(5):
+        QApplication.processEvents()
+    assert in_front(window) == before
+    assert (window.width(), window.height()) == (1280, 760)
+
+
+def test_layouts_of_large_and_small_windows_are_kept_apart(show: Show, tmp_path) -> None:
+    window = show(Settings(workspace="operate"))
+    window.resize(2560, 1400)
+    for _ in range(5):
+        QApplication.processEvents()
+    window.docks["mirror"].hide()
+    for size in ((1280, 760), (2560, 1400)):
+        window.resize(*size)
+        for _ in range(5):
+            QApplication.processEvents()
+    assert not window.docks["mirror"].isVisible()
+    window.actions_by_name["reset_layout"].trigger()
+    QApplication.processEvents()
+    assert window.docks["mirror"].isVisible()
+
+
 def wide_panels(window: MainWindow) -> set[str]:
     """Visible panels that do not fit the width of their dock."""
     areas = {name: dock.widget() for name, dock in window.docks.items() if not dock.visibleRegion().isEmpty()}

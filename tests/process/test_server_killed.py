@@ -125,7 +125,7 @@ def test_a_front_that_was_killed_leaves_a_flat_mirror_and_a_note(system, bench, 
                 lambda: any("run 2: " in line.text for line in client.log_after(-1)), "its line of the log"
             )
             client.abort()
-            # Nothing of what the other front end wrote is missing, also before this client was connected again.
+            # Nothing that the other front end wrote is missing, also before this client was connected again.
             lines = [line for line in client.log_after(-1) if line.number >= _NUMBERS_OF_A_FRONT_END]
             assert [line.number - _NUMBERS_OF_A_FRONT_END for line in lines] == list(range(len(lines)))
         assert seconds < 30
