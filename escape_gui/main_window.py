@@ -130,7 +130,7 @@ class MainWindow(QMainWindow):
         self._may_close = False
         self.handlers = self._make_handlers()
         self.workspace = workspace(settings.workspace)
-        self._is_large = False
+        self._is_large, self._layout = False, QByteArray()
         self._restore()
 
     # ------------------------------------------------------------ construction
@@ -306,6 +306,7 @@ class MainWindow(QMainWindow):
             QTimer.singleShot(0, self, lambda: self.resize(self.size().boundedTo(size)))
         # Docks that were shown again lie above everything else.
         self.overlay.raise_()
+        self._layout = self.saveState(LAYOUT_VERSION)
 
     @property
     def _fits_large_layout(self) -> bool:
@@ -342,8 +343,14 @@ class MainWindow(QMainWindow):
         self._settings.layouts.pop(self._layout_name, None)
         self._apply_layout()
 
+    def _note_layout(self) -> None:
+        """Remember the layout while the window has the size for it: panels are squeezed when it shrinks."""
+        if self._fits_large_layout == self._is_large:
+            self._layout = self.saveState(LAYOUT_VERSION)
+
     def _store_layout(self) -> None:
-        self._settings.layouts[self._layout_name] = _text(self.saveState(LAYOUT_VERSION))
+        self._note_layout()
+        self._settings.layouts[self._layout_name] = _text(self._layout)
 
     def focus_panel(self, step: int) -> None:
         """Move the focus by ``step`` visible panels."""
@@ -391,6 +398,7 @@ class MainWindow(QMainWindow):
         for dock in self.docks.values():
             dock.show_health()
         self.state_notifier.update(state, connected=now.connected)
+        self._note_layout()
         telemetry = state.recording
         self._set_status(
             "recording",

@@ -170,7 +170,7 @@ WORKSPACES: tuple[Workspace, ...] = (
             Column((Cell(("sprint",), 1.3), Cell(("gains", "camera", "devices", "log"), 1.0)), 1.2),
         ),
         (
-            Column((Cell(("procedure",), 2.2), Cell(("log", "devices"), 1.0)), 0.9),
+            Column((Cell(("procedure",), 2.6), Cell(("log", "devices"), 0.8)), 0.9),
             Column((Cell(("modes",)),), 1.3),
             Column((Cell(("sprint",)),), 1.0),
             Column((Cell(("camera",), 1.2), Cell(("gains",), 1.0)), 0.9),

@@ -125,7 +125,9 @@ def test_layouts_of_large_and_small_windows_are_kept_apart(show: Show, tmp_path)
     window.resize(2560, 1400)
     for _ in range(5):
         QApplication.processEvents()
+    widths = [window.docks[name].width() for name in ("loop", "performance", "camera")]
     window.docks["mirror"].hide()
+    window.refresh()
     for size in ((1280, 760), (2560, 1400)):
         window.resize(*size)
         for _ in range(5):
@@ -134,6 +136,27 @@ def test_layouts_of_large_and_small_windows_are_kept_apart(show: Show, tmp_path)
     window.actions_by_name["reset_layout"].trigger()
     QApplication.processEvents()
     assert window.docks["mirror"].isVisible()
+    # As at first, not as it was squeezed into the small window.
+    again = [window.docks[name].width() for name in ("loop", "performance", "camera")]
+    assert again == pytest.approx(widths, rel=0.1)
+
+
+def test_a_layout_is_the_same_after_the_window_was_small(show: Show) -> None:
+    window = show(Settings(workspace="operate"))
+
+    def resize(width: int, height: int) -> None:
+        window.resize(width, height)
+        for _ in range(5):
+            QApplication.processEvents()
+        window.refresh()
+
+    resize(2560, 1400)
+    sizes = [dock.size() for dock in window.docks.values() if dock.isVisible()]
+    resize(1024, 700)
+    resize(2560, 1400)
+    for before, dock in zip(sizes, (dock for dock in window.docks.values() if dock.isVisible()), strict=True):
+        assert dock.width() == pytest.approx(before.width(), rel=0.05)
+        assert dock.height() == pytest.approx(before.height(), rel=0.05)
 
 
 def wide_panels(window: MainWindow) -> set[str]:
