@@ -315,6 +315,8 @@ def test_after_the_end_of_the_engine_nothing_stale_is_shown(
     loop, procedure = window.panels["loop"], window.panels["procedure"]
     loop.on_state(source.state)
     loop.tick(source)
+    assert {one.text() for one in loop.current.values()} == {"–"}
+    assert not loop.modes.text()
     for button in (loop.close_button, procedure.start, procedure.check, window.actions_by_name["record"]):
         assert not button.isEnabled()
         assert "the engine has ended; clear the fault to start it again" in button.toolTip()
