@@ -203,6 +203,10 @@ def test_progress_as_text():
     assert form.progress_line(endless) == "DO-CRIME: 610 frames"
     assert form.worst_mode(np.array([5.0, 3.1, np.nan, np.inf])) == "worst mode 2: SNR 3.1"
     assert form.worst_mode(np.array([np.nan])) == ""
+    aborted = FinishedRun(
+        id=1, name="escape", finish=Finish.ABORTED, message="stopped; the data measured so far are saved"
+    )
+    assert form.result_line(aborted) == "Aborted: escape. stopped; the data measured so far are saved"
     failed = FinishedRun(id=1, name="escape", finish=Finish.FAILED, message="too dark")
     assert form.result_line(failed) == "Failed: escape. too dark"
 
