@@ -206,6 +206,9 @@ class Night:
         self.key(Qt.Key.Key_R, Qt.KeyboardModifier.ControlModifier)
         self.operator.until(lambda: not self.state.recording.recording, "the recording has ended")
         assert list(Path(path).parent.glob(f"{Path(path).name}*")), path
+        self.window.docks["telemetry"].raise_()
+        self.images("record")
+        self.window.docks["performance"].raise_()
 
     def crash(self) -> None:
         """The engine dies: the window says so and offers the remedy; then everything works again."""

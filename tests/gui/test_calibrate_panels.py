@@ -336,6 +336,7 @@ def test_gains_appear_round_by_round(calibrate, source):
     look(calibrate)
     assert "median 0.700" in panel._legend.text()
     assert "2 rounds" in panel._legend.text()
+    assert list(panel.plot._boxes) == ["left"], "the help promises a second axis for matrices of both kinds"
     press_box(panel)
     assert panel.export_arrays()[0].data.shape == (20, 5)
 
