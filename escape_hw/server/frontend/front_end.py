@@ -104,6 +104,7 @@ class FrontEnd:
                     supervisor.receive_messages(engine)
                 for incoming in self._transport.receive_requests():
                     self._handle_request(incoming)
+                self._log.flush()
                 self._leases.expire()
                 self._night_log.update(self._published.state)
                 supervisor.check(self._oldest_safety_request_s())
