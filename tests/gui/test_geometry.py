@@ -224,7 +224,9 @@ def test_buttons_that_are_held_are_visible_in_the_narrowest_window(
         window.update_timer.tick(force=True)
         QApplication.processEvents()
     if panel == "mirror":
-        found.poke_text.setText(f"Mirror flat again after: {found._plan.description}")
+        # The longest text, as while it is held.
+        found._show_poke(f"Held: {found._plan.description}")
         QApplication.processEvents()
+        assert found.poke_text.height() >= found.poke_text.heightForWidth(found.poke_text.width())
         assert found.image_view.geometry().bottom() < found.arm_button.geometry().top()
     assert_is_in_its_dock(getattr(window.panels[panel], button), window, panel)
