@@ -43,7 +43,15 @@ from escape_gui.window.alarm_dialog import AlarmDialog
 from escape_gui.window.camera_dialog import CameraDialog
 from escape_gui.window.closing import CloseQuestion, is_busy
 from escape_gui.window.connect_dialog import ConnectDialog
-from escape_gui.window.docks import WORKSPACES, Dock, arrange_docks, arrange_tab_bars, workspace
+from escape_gui.window.docks import (
+    WORKSPACES,
+    Dock,
+    arrange_docks,
+    arrange_tab_bars,
+    scale_docks,
+    visible_sizes,
+    workspace,
+)
 from escape_gui.window.export import Exporter
 from escape_gui.window.header import AlarmBanner, ControlBanner, FaultBanner, FrozenBanner, HeaderBar
 from escape_gui.window.notifications import NotificationBar, StateNotifier
@@ -60,6 +68,8 @@ LAYOUT_VERSION = 4
 #: Least width and height of a window in which the panels are arranged as on a large screen, pixels at the
 #: normal size of the fonts.
 _LARGE_PX = (2000, 1050)
+#: Least width and height of a window that is large now.
+_LEAST_PX = (800, 500)
 #: Room that is left for the frame of the window manager.
 _FRAME = QSize(8, 32)
 #: Width of the coloured frame of a recorded run, and offset of its window, pixels.
@@ -131,6 +141,8 @@ class MainWindow(QMainWindow):
         self.handlers = self._make_handlers()
         self.workspace = workspace(settings.workspace)
         self._is_large, self._layout = False, QByteArray()
+        #: Size of the dock area and of the docks by layout, to scale the layout to another size.
+        self._dock_sizes: dict[str, tuple[QSize, dict[QDockWidget, QSize]]] = {}
         self._restore()
 
     # ------------------------------------------------------------ construction
@@ -294,11 +306,15 @@ class MainWindow(QMainWindow):
 
     def _apply_layout(self) -> None:
         self._is_large = self._fits_large_layout
+        # The many columns of a large window do not keep it large; a smaller one gets its own layout.
+        self.setMinimumSize(*(_LEAST_PX if self._is_large else (0, 0)))
         stored = self._settings.layouts.get(self._layout_name)
         docks: dict[str, QDockWidget] = dict(self.docks)
         size = self.size()
         if stored is None or not self.restoreState(_bytes(stored), LAYOUT_VERSION):
             arrange_docks(self, docks, self.workspace.arranged(self._is_large))
+        elif self._layout_name in self._dock_sizes:
+            scale_docks(self, *self._dock_sizes[self._layout_name], self._dock_area)
         self.resize(size)
         arrange_tab_bars(self, docks)
         if self.isVisible() and not (self.isMaximized() or self.isFullScreen()):
@@ -347,6 +363,12 @@ class MainWindow(QMainWindow):
         """Remember the layout while the window has the size for it: panels are squeezed when it shrinks."""
         if self._fits_large_layout == self._is_large:
             self._layout = self.saveState(LAYOUT_VERSION)
+            self._dock_sizes[self._layout_name] = (self._dock_area, visible_sizes(self.docks.values()))
+
+    @property
+    def _dock_area(self) -> QSize:
+        """Size of the window without header and last line."""
+        return self.size() - QSize(0, self.menuWidget().height() + self.statusBar().height())
 
     def _store_layout(self) -> None:
         self._note_layout()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -251,6 +252,21 @@ def arrange_tab_bars(window: QMainWindow, docks: dict[str, QDockWidget]) -> None
         bar.setElideMode(Qt.TextElideMode.ElideNone)
         bar.setUsesScrollButtons(True)
         bar.setExpanding(False)
+
+
+def visible_sizes(docks: Iterable[QDockWidget]) -> dict[QDockWidget, QSize]:
+    """Sizes of the docks that are not hidden, floating or behind another tab."""
+    return {dock: dock.size() for dock in docks if not (dock.isFloating() or dock.visibleRegion().isEmpty())}
+
+
+def scale_docks(window: QMainWindow, before: QSize, sizes: dict[QDockWidget, QSize], area: QSize) -> None:
+    """Scale docks from an area of the size ``before``; Qt takes what is missing from a few of them."""
+    docks = list(sizes)
+    for orientation, scale, pixels in (
+        (Qt.Orientation.Horizontal, area.width() / before.width(), QSize.width),
+        (Qt.Orientation.Vertical, area.height() / before.height(), QSize.height),
+    ):
+        window.resizeDocks(docks, [round(scale * pixels(sizes[dock])) for dock in docks], orientation)
 
 
 def _front_dock(docks: dict[str, QDockWidget], cell: Cell) -> QDockWidget:

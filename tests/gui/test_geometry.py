@@ -16,7 +16,7 @@ from scripted import ScriptedSource
 from escape_gui.client.session import Session
 from escape_gui.main_window import MainWindow
 from escape_gui.settings import Settings
-from escape_gui.window.docks import WORKSPACES
+from escape_gui.window.docks import WORKSPACES, visible_sizes
 from escape_hw.api.registration import TO_STREAM_UNITS
 from escape_hw.io.documents import calibration_document
 from escape_hw.remote.state import (
@@ -141,22 +141,42 @@ def test_layouts_of_large_and_small_windows_are_kept_apart(show: Show, tmp_path)
     assert again == pytest.approx(widths, rel=0.1)
 
 
-def test_a_layout_is_the_same_after_the_window_was_small(show: Show) -> None:
-    window = show(Settings(workspace="operate"))
+@pytest.mark.parametrize("workspace", [one.name for one in WORKSPACES])
+def test_a_layout_is_the_same_after_the_window_had_another_size(workspace: str, show: Show) -> None:
+    window = show(Settings(workspace=workspace))
 
     def resize(width: int, height: int) -> None:
         window.resize(width, height)
         for _ in range(5):
             QApplication.processEvents()
         window.refresh()
+        assert (window.width(), window.height()) == (width, height)
 
-    resize(2560, 1400)
-    sizes = [dock.size() for dock in window.docks.values() if dock.isVisible()]
-    resize(1024, 700)
-    resize(2560, 1400)
-    for before, dock in zip(sizes, (dock for dock in window.docks.values() if dock.isVisible()), strict=True):
-        assert dock.width() == pytest.approx(before.width(), rel=0.05)
-        assert dock.height() == pytest.approx(before.height(), rel=0.05)
+    for one, other in (((2560, 1400), (1024, 700)), ((1024, 700), (2560, 1400)), ((1600, 960), (2560, 1400))):
+        resize(*one)
+        window.reset_layout()
+        resize(*one)
+        before = visible_sizes(window.docks.values())
+        resize(*other)
+        resize(*one)
+        for dock in visible_sizes(window.docks.values()):
+            assert dock.width() == pytest.approx(before[dock].width(), rel=0.1), (one, dock.windowTitle())
+            assert dock.height() == pytest.approx(before[dock].height(), rel=0.1), (one, dock.windowTitle())
+
+
+@pytest.mark.parametrize("workspace", [one.name for one in WORKSPACES])
+def test_a_layout_is_scaled_to_a_window_that_was_large_meanwhile(workspace: str, show: Show) -> None:
+    window = show(Settings(workspace=workspace))
+    sizes = []
+    for size in ((1600, 960), (2560, 1400), (1200, 720)):
+        window.resize(*size)
+        for _ in range(5):
+            QApplication.processEvents()
+        window.refresh()
+        sizes.append(visible_sizes(window.docks.values()))
+    for dock, size in sizes[2].items():
+        assert size.width() == pytest.approx(0.75 * sizes[0][dock].width(), rel=0.15), dock.windowTitle()
+        assert size.height() == pytest.approx(0.72 * sizes[0][dock].height(), rel=0.15), dock.windowTitle()
 
 
 def wide_panels(window: MainWindow) -> set[str]:
