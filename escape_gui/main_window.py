@@ -280,7 +280,7 @@ class MainWindow(QMainWindow):
                 for dock in self.docks.values():
                     submenu.addAction(dock.toggleViewAction())
         bar.setCornerWidget(self.tabs, Qt.Corner.TopRightCorner)
-        top = QWidget()
+        top = self._top = QWidget()
         top.setObjectName("header")
         top.setAttribute(Qt.WidgetAttribute.WA_StyledBackground)
         banners = (self.fault_banner, self.alarm_banner, self.control_banner, self.frozen_banner)
@@ -368,7 +368,7 @@ class MainWindow(QMainWindow):
     @property
     def _dock_area(self) -> QSize:
         """Size of the window without header and last line."""
-        return self.size() - QSize(0, self.menuWidget().height() + self.statusBar().height())
+        return self.size() - QSize(0, self._top.height() + self.statusBar().height())
 
     def _store_layout(self) -> None:
         self._note_layout()

@@ -106,6 +106,8 @@ def test_trends_are_drawn_over_hours_and_over_nights(
     make_window, source: ScriptedSource, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ):
     monkeypatch.setattr("escape_gui.panels.trends.runs_folder", lambda session: tmp_path)
+    # One night, also at noon, when the next one begins.
+    monkeypatch.setattr("escape_gui.panels.trends.night_of", lambda time: "2026-11-22")
     window: MainWindow = make_window((TrendsPanel,))
     panel = window.panels["trends"]
     assert isinstance(panel, TrendsPanel)
