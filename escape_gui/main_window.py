@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 
 from PySide6.QtCore import QByteArray, QPoint, QRect, QSize, Qt, QTimer
-from PySide6.QtGui import QAction, QCloseEvent, QKeySequence
+from PySide6.QtGui import QAction, QCloseEvent, QKeySequence, QResizeEvent
 from PySide6.QtWidgets import (
     QApplication,
     QDockWidget,
@@ -43,7 +43,15 @@ from escape_gui.window.alarm_dialog import AlarmDialog
 from escape_gui.window.camera_dialog import CameraDialog
 from escape_gui.window.closing import CloseQuestion, is_busy
 from escape_gui.window.connect_dialog import ConnectDialog
-from escape_gui.window.docks import WORKSPACES, Dock, arrange_docks, arrange_tab_bars, workspace
+from escape_gui.window.docks import (
+    WORKSPACES,
+    Dock,
+    arrange_docks,
+    arrange_tab_bars,
+    scale_docks,
+    visible_sizes,
+    workspace,
+)
 from escape_gui.window.export import Exporter
 from escape_gui.window.header import AlarmBanner, ControlBanner, FaultBanner, FrozenBanner, HeaderBar
 from escape_gui.window.notifications import NotificationBar, StateNotifier
@@ -57,6 +65,11 @@ from escape_hw.remote.state import State
 log = logging.getLogger(__name__)
 #: Version of the dock arrangement that Qt stores; layouts of other versions are discarded.
 LAYOUT_VERSION = 4
+#: Least width and height of a window in which the panels are arranged as on a large screen, pixels at the
+#: normal size of the fonts.
+_LARGE_PX = (2000, 1050)
+#: Least width and height of a window that is large now.
+_LEAST_PX = (800, 500)
 #: Room that is left for the frame of the window manager.
 _FRAME = QSize(8, 32)
 #: Width of the coloured frame of a recorded run, and offset of its window, pixels.
@@ -127,6 +140,9 @@ class MainWindow(QMainWindow):
         self._may_close = False
         self.handlers = self._make_handlers()
         self.workspace = workspace(settings.workspace)
+        self._is_large, self._layout = False, QByteArray()
+        #: Size of the dock area and of the docks by layout, to scale the layout to another size.
+        self._dock_sizes: dict[str, tuple[QSize, dict[QDockWidget, QSize]]] = {}
         self._restore()
 
     # ------------------------------------------------------------ construction
@@ -264,7 +280,7 @@ class MainWindow(QMainWindow):
                 for dock in self.docks.values():
                     submenu.addAction(dock.toggleViewAction())
         bar.setCornerWidget(self.tabs, Qt.Corner.TopRightCorner)
-        top = QWidget()
+        top = self._top = QWidget()
         top.setObjectName("header")
         top.setAttribute(Qt.WidgetAttribute.WA_StyledBackground)
         banners = (self.fault_banner, self.alarm_banner, self.control_banner, self.frozen_banner)
@@ -289,11 +305,16 @@ class MainWindow(QMainWindow):
         )
 
     def _apply_layout(self) -> None:
-        stored = self._settings.layouts.get(self.workspace.name)
+        self._is_large = self._fits_large_layout
+        # The many columns of a large window do not keep it large; a smaller one gets its own layout.
+        self.setMinimumSize(*(_LEAST_PX if self._is_large else (0, 0)))
+        stored = self._settings.layouts.get(self._layout_name)
         docks: dict[str, QDockWidget] = dict(self.docks)
         size = self.size()
         if stored is None or not self.restoreState(_bytes(stored), LAYOUT_VERSION):
-            arrange_docks(self, docks, self.workspace)
+            arrange_docks(self, docks, self.workspace.arranged(self._is_large))
+        elif self._layout_name in self._dock_sizes:
+            scale_docks(self, *self._dock_sizes[self._layout_name], self._dock_area)
         self.resize(size)
         arrange_tab_bars(self, docks)
         if self.isVisible() and not (self.isMaximized() or self.isFullScreen()):
@@ -301,6 +322,27 @@ class MainWindow(QMainWindow):
             QTimer.singleShot(0, self, lambda: self.resize(self.size().boundedTo(size)))
         # Docks that were shown again lie above everything else.
         self.overlay.raise_()
+        self._layout = self.saveState(LAYOUT_VERSION)
+
+    @property
+    def _fits_large_layout(self) -> bool:
+        least = QSize(*map(self.context.theme.pixels, _LARGE_PX))
+        return self.width() >= least.width() and self.height() >= least.height()
+
+    @property
+    def _layout_name(self) -> str:
+        """Name of the present layout in the settings; that of a large window is another one."""
+        return f"{self.workspace.name}-large" if self._is_large else self.workspace.name
+
+    def _change_layout(self) -> None:
+        """Arrange the panels anew when the window has become large, or is no longer."""
+        if self._fits_large_layout != self._is_large:
+            self._store_layout()
+            self._apply_layout()
+
+    def resizeEvent(self, event: QResizeEvent) -> None:
+        super().resizeEvent(event)
+        QTimer.singleShot(0, self, self._change_layout)
 
     def show_workspace(self, name: str) -> None:
         """Save the layout of this workspace and change to another one."""
@@ -314,11 +356,23 @@ class MainWindow(QMainWindow):
         self.setFocus()
 
     def reset_layout(self) -> None:
-        self._settings.layouts.pop(self.workspace.name, None)
+        self._settings.layouts.pop(self._layout_name, None)
         self._apply_layout()
 
+    def _note_layout(self) -> None:
+        """Remember the layout while the window has the size for it: panels are squeezed when it shrinks."""
+        if self._fits_large_layout == self._is_large:
+            self._layout = self.saveState(LAYOUT_VERSION)
+            self._dock_sizes[self._layout_name] = (self._dock_area, visible_sizes(self.docks.values()))
+
+    @property
+    def _dock_area(self) -> QSize:
+        """Size of the window without header and last line."""
+        return self.size() - QSize(0, self._top.height() + self.statusBar().height())
+
     def _store_layout(self) -> None:
-        self._settings.layouts[self.workspace.name] = _text(self.saveState(LAYOUT_VERSION))
+        self._note_layout()
+        self._settings.layouts[self._layout_name] = _text(self._layout)
 
     def focus_panel(self, step: int) -> None:
         """Move the focus by ``step`` visible panels."""
@@ -366,6 +420,7 @@ class MainWindow(QMainWindow):
         for dock in self.docks.values():
             dock.show_health()
         self.state_notifier.update(state, connected=now.connected)
+        self._note_layout()
         telemetry = state.recording
         self._set_status(
             "recording",

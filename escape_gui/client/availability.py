@@ -43,6 +43,11 @@ def has_engine(state: State) -> bool:
     return is_measured(state) and state.engine_pid != 0
 
 
+def has_ended(state: State) -> bool:
+    """Whether the engine has died and was not started again."""
+    return is_measured(state) and state.engine_pid == 0 and state.phase is Phase.FAULT
+
+
 def has_frames(state: State) -> bool:
     """Whether frames have arrived, so that the illumination is known."""
     return has_engine(state) and state.rates.frames > 0

@@ -10,10 +10,14 @@ from numpy.typing import NDArray
 from PySide6.QtCore import Qt
 from PySide6.QtWidgets import QLabel, QStackedLayout, QVBoxLayout, QWidget
 
+from escape_gui.client.availability import has_ended
 from escape_gui.client.session import Session
 from escape_gui.theme import Theme
 from escape_hw.remote.source import DataSource, Sample
 from escape_hw.remote.state import DeviceHealth, Geometry, Phase, State
+
+#: Placeholder of a panel whose data came from an engine that has died.
+ENGINE_ENDED_TEXT = "No data: the engine has ended.\nClear the fault to start it again."
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -122,6 +126,8 @@ class Panel(QWidget):
                 self._last_sample_s = time.monotonic()
                 self.show_placeholder(False)
                 self.on_sample(stream, sample)
+        if self.streams and self.shows_placeholder and has_ended(state):
+            self.show_placeholder(True, ENGINE_ENDED_TEXT)
         geometry = source.geometry()
         if geometry is not self.bench_geometry:
             self.bench_geometry = geometry

@@ -26,8 +26,8 @@ class GainsPanel(Panel):
     tab_title: ClassVar[str] = "Gains"
     help = (
         "Sensitivity of the sensor in operation, by mode, relative to each matrix: measured gains with error "
-        "bars, and their trend over the modes. Matrices with gains below 1 are on the left axis, those above "
-        "1, measured in open loop, on the right axis."
+        "bars, and their trend over the modes. If some matrices have gains below 1 and others, measured in "
+        "open loop, gains above 1, the latter have an axis of their own on the right."
     )
     streams: ClassVar[tuple[str, ...]] = ("gains", "gains_sigma", "gains_smooth", "gains_rounds")
     rate_hz = 5.0

@@ -9,7 +9,13 @@ from typing import ClassVar
 from PySide6.QtCore import Qt
 from PySide6.QtWidgets import QComboBox, QGridLayout, QLabel, QPushButton, QWidget
 
-from escape_gui.client.availability import is_measured, reason_no_change, reason_no_start
+from escape_gui.client.availability import (
+    UNKNOWN_VALUE,
+    has_ended,
+    is_measured,
+    reason_no_change,
+    reason_no_start,
+)
 from escape_gui.panels.base import Context, Panel
 from escape_gui.views.loop_form import FIELDS, LIMITS, LoopSettingsEdit
 from escape_gui.widgets.controls import (
@@ -134,13 +140,15 @@ class LoopPanel(Panel):
         self.loop_indicator.set_status(
             Level.ACTIVE if loop.closed else Level.NEUTRAL, "closed" if loop.closed else "open"
         )
-        self.modes.setText(f"{loop.n_modes} modes controlled" if loop.n_modes else "")
+        ended = has_ended(state)
+        self.modes.setText(f"{loop.n_modes} modes controlled" if loop.n_modes and not ended else "")
         values = {
             "matrix": loop.matrix or "none", "gain": f"{loop.gain:.4f}", "leak": f"{loop.leak:.4f}",
             "dropped_modes": str(loop.dropped_modes),
         }  # fmt: skip
         for name, text in values.items():
-            self.current[name].setText(text)
+            # Without an engine nothing is in use.
+            self.current[name].setText(UNKNOWN_VALUE if ended else text)
         summaries = {product.name: product.summary for product in state.products if product.kind == "matrix"}
         if list(summaries) != self._matrices:
             self._set_matrix_choices(summaries)

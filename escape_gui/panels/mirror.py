@@ -26,6 +26,7 @@ from escape_gui.widgets.controls import (
     SegmentedButton,
     caption,
     column,
+    fit_height,
     flat_button,
     readout_grid,
     row,
@@ -192,6 +193,11 @@ class MirrorPanel(Panel):
     def resizeEvent(self, event: QResizeEvent) -> None:
         super().resizeEvent(event)
         self._fit_head()
+        fit_height(self.poke_text)
+
+    def _show_poke(self, text: str) -> None:
+        self.poke_text.setText(text)
+        fit_height(self.poke_text)
 
     def _fit_head(self) -> None:
         """A low panel has no room for the row above the map and the controls of a poke."""
@@ -226,13 +232,13 @@ class MirrorPanel(Panel):
         request = (kind, number, self.poke_amplitude.value(), self.poke_seconds.value())
         for box in (self.poke_number, self.poke_amplitude, self.poke_seconds):
             if not box.low <= box.value() <= box.high:
-                self.poke_text.setText(
+                self._show_poke(
                     f"{box.accessibleName()}: {box.value():g} is out of range: {box.low:g} to {box.high:g}"
                 )
                 return
         self.context.session.ask(
             "plan the poke", lambda server: server.check_poke(*request),
-            lambda plan: self._show_plan(plan, request), self.poke_text.setText, quiet=True,
+            lambda plan: self._show_plan(plan, request), self._show_poke, quiet=True,
         )  # fmt: skip
 
     @property
@@ -243,7 +249,7 @@ class MirrorPanel(Panel):
     def _show_plan(self, plan: PokePlan, request: tuple[str, int, float, float]) -> None:
         if request == self._poke_request:
             self._plan = plan
-            self.poke_text.setText(
+            self._show_poke(
                 plan.refusal or f"{plan.description} for {request[3]:g} s; limit ±{plan.allowed:.3g}"
             )
 
@@ -256,7 +262,7 @@ class MirrorPanel(Panel):
         self._armed_until = time.monotonic() + ARMED_S
         self.context.session.ask(
             "poke the mirror", lambda server: server.poke(*request),
-            lambda _: self.poke_text.setText(f"Held: {description}"), self.poke_text.setText, quiet=True,
+            lambda _: self._show_poke(f"Held: {description}"), self._show_poke, quiet=True,
         )  # fmt: skip
 
     @property
@@ -277,7 +283,8 @@ class MirrorPanel(Panel):
         refused = "no plan yet" if plan is None else "see above" if plan.refusal else ""
         set_available(self.poke_button, _POKE_TIP, reason or refused)
         if armed and not held and plan is not None and self.poke_text.text().startswith("Held"):
-            self.poke_text.setText(f"Mirror flat again after: {plan.description}")
+            # Kind and number; the amplitude is in the fields above.
+            self._show_poke(f"Mirror flat again after: {plan.description.partition(' at ')[0]}")
 
     # ------------------------------------------------------------ data
     def on_geometry(self) -> None:

@@ -25,6 +25,7 @@ from escape_gui.widgets.argument_form import ArgumentForm
 from escape_gui.widgets.controls import (
     QUALITY_LEVELS,
     Level,
+    fit_height,
     row,
     scroll_area,
     set_available,
@@ -167,7 +168,7 @@ class ProcedurePanel(Panel):
             # The width is known some time after they were shown.
             self._result_width = self.numbers.width()
             for label in (self.outcome, self.verdict, self.numbers):
-                _fit_height(label)
+                fit_height(label)
 
     def on_sample(self, stream: str, sample: Sample) -> None:
         self._matrix[stream] = sample.data
@@ -290,7 +291,7 @@ class ProcedurePanel(Panel):
     def resizeEvent(self, event: QResizeEvent) -> None:
         super().resizeEvent(event)
         for label in (self._description, self.plan, self.progress, self._metrics):
-            _fit_height(label)
+            fit_height(label)
 
     def apply_theme(self) -> None:
         theme = self.context.theme
@@ -306,12 +307,4 @@ def _set_text(label: QLabel, text: str) -> None:
     """Set the text of a label, and hide the label if it is empty."""
     label.setText(text)
     label.setVisible(bool(text))
-    _fit_height(label)
-
-
-def _fit_height(label: QLabel) -> None:
-    """Set the minimum height of wrapped text; the layout of the panel ignores its height for width."""
-    # The height for a width is never less than the minimum.
-    label.setMinimumHeight(0)
-    if label.text():
-        label.setMinimumHeight(max(0, label.heightForWidth(label.width())))
+    fit_height(label)

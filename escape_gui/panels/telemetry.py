@@ -68,6 +68,8 @@ class TelemetryPanel(Panel):
         self._folder: Path | None = None
         self._next: Path | None = None
         self._busy, self._analysed_s, self._recorded = False, 0.0, RecordingState()
+        #: Recording whose end was noticed.
+        self._ended_path = ""
         self._make_controls()
         theme = context.theme
         self.residual, self.spectra = ResidualPlot(theme), SpectraPlot(theme)
@@ -127,8 +129,7 @@ class TelemetryPanel(Panel):
         )
 
     def on_state(self, state: State) -> None:
-        recording, before = state.recording, self._recorded
-        self._recorded = recording
+        recording = self._recorded = state.recording
         on = recording.recording
         self.record_button.setText("Stop" if on else "Record")
         tip = "Stop the recording" if on else "Record slopes, residuals and commands at full rate"
@@ -136,7 +137,9 @@ class TelemetryPanel(Panel):
         for widget in (self.seconds, self.images):
             widget.setEnabled(not on)
         self.growth.setText(("● " if on else "") + describe_growth(recording, _age_s(recording.started_utc)))
-        has_ended = before.recording and not on and bool(recording.path)
+        # Also a recording that was made while this panel was hidden.
+        has_ended = not on and bool(recording.path) and recording.path != self._ended_path
+        self._ended_path = "" if on else recording.path
         if has_ended or (on and time.monotonic() - self._analysed_s > _PERIOD_S):
             self.open_recording(Path(recording.path))
 

@@ -111,7 +111,8 @@ def plan_lines(plan: ProcedurePlan, *, simulated: bool = False) -> list[str]:
     stroke = f"largest command about {100 * plan.stroke:.2g} % of stroke" if plan.stroke else "no pokes"
     if not plan.frames:
         return ["no frames needed: computed from existing data", ""]
-    return [f"{plan.frames} frames, {format_duration(plan.seconds)} at the {rate}", stroke]
+    prepare = f", {plan.preparation_frames} of them to prepare" if plan.preparation_frames else ""
+    return [f"{plan.frames} sensor frames{prepare}; {format_duration(plan.seconds)} at the {rate}", stroke]
 
 
 def progress_line(running: ActiveRun) -> str:
@@ -191,7 +192,7 @@ def _frames_line(now: Mapping[str, Any]) -> str:
     seconds, lost = now.get("sky_seconds"), now.get("lost_frames")
     if not isinstance(seconds, int | float) and now.get("rate_hz"):
         seconds = now["frames"] / now["rate_hz"]
-    parts = [f"Frames: {now['frames']}"]
+    parts = [f"Frames measured: {now['frames']}"]
     if isinstance(seconds, int | float):
         parts.append(f"{format_duration(seconds)}{' (simulated)' if now.get('simulated') else ''}")
     if isinstance(lost, int | float):

@@ -76,6 +76,14 @@ def text_label() -> QLabel:
     return label
 
 
+def fit_height(label: QLabel) -> None:
+    """Set the minimum height of wrapped text; the layout of a panel ignores its height for width."""
+    # The height for a width is never less than the minimum.
+    label.setMinimumHeight(0)
+    if label.text():
+        label.setMinimumHeight(max(0, label.heightForWidth(label.width())))
+
+
 def flat_button(text: str, tip: str, *, checkable: bool = False, checked: bool = False) -> QToolButton:
     """A button without a frame; the tooltip is its accessible name, too."""
     button = QToolButton()

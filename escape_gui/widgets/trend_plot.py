@@ -104,6 +104,10 @@ class TrendsPlot(PlotGrid):
                 item.set(x, y, sigma)
             else:
                 item.setData(x, y)
+        for plot, trend in zip(self._plots, TRENDS, strict=True):
+            # Numbers on the axis of a plot without data would be read as values.
+            known = any(name in self._curves and self._curves[name].size for name in trend.names)
+            plot.getAxis("left").setStyle(showValues=known)
         if self._drawn_marks != self._marks:
             self._drawn_marks = self._marks
             for plot, line in self._lines:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 from PySide6.QtCore import QSize, Qt, Signal
@@ -125,12 +126,17 @@ class Column:
 
 @dataclass(frozen=True, slots=True)
 class Workspace:
-    """A named arrangement of panels."""
+    """A named arrangement of panels: columns of a window of any size, and of a large one."""
 
     name: str
     title: str
     purpose: str
     columns: tuple[Column, ...]
+    large_columns: tuple[Column, ...]
+
+    def arranged(self, large: bool) -> Workspace:
+        """The workspace with the columns of a large window, or with the others."""
+        return replace(self, columns=self.large_columns) if large else self
 
     @property
     def panels(self) -> tuple[str, ...]:
@@ -147,6 +153,11 @@ WORKSPACES: tuple[Workspace, ...] = (
             Column((Cell(("camera",)),), 1.5),
             Column((Cell(("mirror",), 1.0), Cell(("psf",), 1.2)), 1.0),
         ),
+        (
+            Column((Cell(("devices",), 0.6), Cell(("log",), 1.0)), 0.9),
+            Column((Cell(("camera",)),), 1.5),
+            Column((Cell(("mirror",), 1.0), Cell(("psf",), 1.2)), 1.0),
+        ),
     ),
     Workspace(
         "calibrate",
@@ -158,6 +169,12 @@ WORKSPACES: tuple[Workspace, ...] = (
             # The mosaic and the detail of a mode share a column.
             Column((Cell(("modes",)),), 1.25),
             Column((Cell(("sprint",), 1.3), Cell(("gains", "camera", "devices", "log"), 1.0)), 1.2),
+        ),
+        (
+            Column((Cell(("procedure",), 2.6), Cell(("log", "devices"), 0.8)), 0.9),
+            Column((Cell(("modes",)),), 1.3),
+            Column((Cell(("sprint",)),), 1.0),
+            Column((Cell(("camera",), 1.2), Cell(("gains",), 1.0)), 0.9),
         ),
     ),
     Workspace(
@@ -172,6 +189,12 @@ WORKSPACES: tuple[Workspace, ...] = (
                 1.5,
             ),
             Column((Cell(("camera",), 1.0), Cell(("psf", "mirror"), 1.15)), 1.1),
+        ),
+        (
+            Column((Cell(("loop",), 1.0), Cell(("devices", "procedure"), 0.9), Cell(("log",), 0.8)), 0.8),
+            Column((Cell(("performance", "telemetry"), 1.2), Cell(("night",), 1.0)), 1.3),
+            Column((Cell(("camera",), 1.0), Cell(("psf",), 1.15)), 1.0),
+            Column((Cell(("mirror",), 1.0), Cell(("trends", "latency"), 1.15)), 0.9),
         ),
     ),
 )
@@ -229,6 +252,21 @@ def arrange_tab_bars(window: QMainWindow, docks: dict[str, QDockWidget]) -> None
         bar.setElideMode(Qt.TextElideMode.ElideNone)
         bar.setUsesScrollButtons(True)
         bar.setExpanding(False)
+
+
+def visible_sizes(docks: Iterable[QDockWidget]) -> dict[QDockWidget, QSize]:
+    """Sizes of the docks that are not hidden, floating or behind another tab."""
+    return {dock: dock.size() for dock in docks if not (dock.isFloating() or dock.visibleRegion().isEmpty())}
+
+
+def scale_docks(window: QMainWindow, before: QSize, sizes: dict[QDockWidget, QSize], area: QSize) -> None:
+    """Scale docks from an area of the size ``before``; Qt takes what is missing from a few of them."""
+    docks = list(sizes)
+    for orientation, scale, pixels in (
+        (Qt.Orientation.Horizontal, area.width() / before.width(), QSize.width),
+        (Qt.Orientation.Vertical, area.height() / before.height(), QSize.height),
+    ):
+        window.resizeDocks(docks, [round(scale * pixels(sizes[dock])) for dock in docks], orientation)
 
 
 def _front_dock(docks: dict[str, QDockWidget], cell: Cell) -> QDockWidget:

@@ -61,6 +61,8 @@ def _program() -> str:
 #: Silence after which a server counts as disconnected; it publishes its state five times a second.
 _STALE_S = 2.0
 _LINES = 5000
+#: Log lines in one reply, the most that a server sends.
+_LINES_AT_ONCE = 1000
 #: Entries of the night log that are kept: more than two nights.
 _NIGHT_ENTRIES = 20_000
 #: Longest wait for the reply to the last request, seconds.
@@ -110,6 +112,8 @@ class Connection(DeviceRequests):
         self._night: deque[NightEntry] = deque(maxlen=_NIGHT_ENTRIES)
         #: Number of the newest entry of the night log that the server is known to have.
         self._newest_night = -1
+        #: Number of the newest line of the log that the server is known to have.
+        self._newest_line = -1
         self._ended: dict[int, FinishedRun] = {}
         self._geometry: tuple[object, Geometry] | None = None
         self._procedures: tuple[ProcedureEntry, ...] | None = None
@@ -131,12 +135,19 @@ class Connection(DeviceRequests):
         self._registered, self._waits_for_place = True, False
         with self._changed:
             self._state = State.model_validate(answer)
-        lines, _ = self._request("log", count=1000)
-        with self._changed:
-            known = {line.number for line in self._log}
-            old = [LogLine.model_validate(line) for line in lines if line["number"] not in known]
-            self._log = deque(sorted((*old, *self._log), key=lambda line: line.number), maxlen=_LINES)
+        lines, _ = self._request("log", after=self._last_line, count=_LINES_AT_ONCE)
+        self._add_log_lines(lines)
         self._read_night_log()
+
+    def _add_log_lines(self, documents: Sequence[Mapping[str, Any]]) -> None:
+        with self._changed:
+            lines = map(LogLine.model_validate, documents)
+            self._log.extend(line for line in lines if line.number > self._last_line)
+
+    @property
+    def _last_line(self) -> int:
+        """Number of the last line of the log up to which none is missing."""
+        return self._log[-1].number if self._log else -1
 
     def _read_night_log(self) -> None:
         """Read the entries of the night log that this client does not have."""
@@ -204,11 +215,16 @@ class Connection(DeviceRequests):
         # What was published while this client was disconnected, or too slow.
         if self._newest_night > (last := self._last_night):
             return {"verb": "night_log", "client": self.client, "after": last}
+        if self._newest_line > (line := self._last_line):
+            return {"verb": "log", "client": self.client, "after": line, "count": _LINES_AT_ONCE}
         return {"verb": "heartbeat", "client": self.client}
 
     def _on_heartbeat_answer(self, answer: Any) -> None:
         if isinstance(answer, list):
-            self._add_night_entries(answer)
+            if answer and "logger" in answer[0]:
+                self._add_log_lines(answer)
+            else:
+                self._add_night_entries(answer)
         elif isinstance(answer, dict) and not self._closed:
             self._registered, self._waits_for_place = True, False
 
@@ -232,9 +248,12 @@ class Connection(DeviceRequests):
             if topic == "state":
                 self._state = State.model_validate(document)
                 self._newest_night = max(self._newest_night, self._state.last_night_entry)
+                self._newest_line = max(self._newest_line, self._state.last_log_line)
             elif topic == "log":
                 line = LogLine.model_validate(document)
-                if not self._log or line.number > self._log[-1].number:
+                self._newest_line = max(self._newest_line, line.number)
+                # After a gap, the next heartbeat requests this line with those before it.
+                if line.number == self._last_line + 1:
                     self._log.append(line)
             elif topic == "night":
                 entry = NightEntry.model_validate(document)

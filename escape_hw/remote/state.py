@@ -293,6 +293,8 @@ class State(StateDocument):
     geometry_version: int = 0
     #: Number of the newest entry of the night log; -1 if there is none.
     last_night_entry: int = -1
+    #: Number of the newest line of the log; -1 if there is none.
+    last_log_line: int = -1
     clients: int = 0
     #: Seconds since a client had control; 0 while one has it, or if none ever had it.
     unattended_for_s: float = 0.0
@@ -399,17 +401,20 @@ class ProcedurePlan(StateDocument):
 
     name: str
     arguments: dict[str, Any]
-    #: Number of frames, and seconds at the present frame rate.
+    #: Number of sensor frames, and seconds at the present frame rate.
     frames: int
     seconds: float
     #: Largest poke of an actuator, as fraction of full stroke.
     stroke: float
+    #: Of these frames, those of the preparation, which the result does not count.
+    preparation_frames: int = 0
     warnings: tuple[str, ...] = ()
 
     def _repr_html_(self) -> str:
         given = {key: value for key, value in self.arguments.items() if value is not None}
         rows: dict[str, object] = {
-            "frames": self.frames,
+            "sensor frames": self.frames,
+            "of them to prepare": self.preparation_frames,
             "at the camera's rate": f"{self.seconds:.1f} s",
             "largest poke": f"{100 * self.stroke:.3g} % of the stroke" if self.stroke else "none",
             "arguments": ", ".join(f"{key} {value}" for key, value in given.items()),

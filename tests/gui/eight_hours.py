@@ -85,7 +85,7 @@ def main() -> None:
     print(
         json.dumps({
             "start_mb": start_mb, "end_mb": memory_mb(), "states": n_states,
-            "peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3,
+            "peak_mb": 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6,
         })
     )  # fmt: skip
     dispose(window)

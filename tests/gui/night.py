@@ -206,6 +206,9 @@ class Night:
         self.key(Qt.Key.Key_R, Qt.KeyboardModifier.ControlModifier)
         self.operator.until(lambda: not self.state.recording.recording, "the recording has ended")
         assert list(Path(path).parent.glob(f"{Path(path).name}*")), path
+        self.window.docks["telemetry"].raise_()
+        self.images("record")
+        self.window.docks["performance"].raise_()
 
     def crash(self) -> None:
         """The engine dies: the window says so and offers the remedy; then everything works again."""
@@ -316,7 +319,7 @@ class Night:
         QTest.keyClicks(self.log.note, note)
         QTest.keyClick(self.log.note, Qt.Key.Key_Return)
         self.operator.until(lambda: note in self.log.text.toPlainText(), "the note is listed")
-        assert not self.log.note.text()
+        self.operator.until(lambda: not self.log.note.text(), "the field is cleared")
         self.images("night_log")
         with tempfile.TemporaryDirectory() as temporary:
             page = (self.folder or Path(temporary)) / "night.html"

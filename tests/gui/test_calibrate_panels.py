@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
+from itertools import combinations
 from pathlib import Path
 
 import fake_results as fake
 import numpy as np
 import pytest
 from gui_windows import dispose, enter_argument, show_window
-from PySide6.QtCore import QPoint, Qt
+from pyqtgraph import AxisItem
+from PySide6.QtCore import QPoint, QRectF, Qt
+from PySide6.QtGui import QImage, QPainter
 from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QApplication, QPushButton
 from scripted import ScriptedControl, ScriptedSource
@@ -65,6 +68,15 @@ MATRIX = fake.calibration("docrime-whitened", n=24, n_modes=30).matrix
 RUNNING = ActiveRun(
     id=3, name="escape", arguments={}, stage="DO-CRIME", completed=610, total=1000, remaining_s=252.0
 )
+
+
+def labels(axis: AxisItem) -> list[QRectF]:
+    """Rectangles of the numbers of an axis, as they are drawn."""
+    image = QImage(8, 8, QImage.Format.Format_ARGB32)
+    painter = QPainter(image)
+    _, _, texts = axis.generateDrawSpecs(painter)
+    painter.end()
+    return [place for place, _, text in texts if text]
 
 
 @pytest.fixture
@@ -131,6 +143,18 @@ def test_mode_maps_fill_in_while_they_are_measured(calibrate, source):
     assert contrast(panel) > 2 * pale
     panel.weight_by_snr.setChecked(False)
     assert contrast(panel) > 2 * pale
+
+
+def test_live_maps_belong_to_the_run_that_measures(calibrate, source):
+    panel = calibrate.panels["modes"]
+    source.change(phase=Phase.PROCEDURE, active_run=RUNNING)
+    measure(source, 1.0)
+    look(calibrate)
+    assert panel.matrix_selector.currentData() == LIVE_LABEL
+    # The next run has measured nothing yet.
+    source.change(active_run=RUNNING.model_copy(update={"id": 4, "completed": 0}))
+    look(calibrate)
+    assert LIVE_LABEL not in panel.matrices
 
 
 def contrast(panel: ModesPanel) -> float:
@@ -263,6 +287,12 @@ def test_sprint_shows_its_iterations_and_its_end(calibrate, source):
         source.change(last_run=ended)
         look(calibrate)
         assert panel._indicator.text == "converged, 18 iterations"
+    for size in ((1600, 1000), (1280, 760)):
+        calibrate.resize(*size)
+        look(calibrate)
+        places = labels(panel.plot._plots[0].getAxis("left"))
+        assert places, size
+        assert not any(a.intersects(b) for a, b in combinations(places, 2)), f"labels overlap at {size}"
     press(panel.units)
     assert panel.plot.physical
     table = panel.export_arrays()[0].data
@@ -306,6 +336,7 @@ def test_gains_appear_round_by_round(calibrate, source):
     look(calibrate)
     assert "median 0.700" in panel._legend.text()
     assert "2 rounds" in panel._legend.text()
+    assert list(panel.plot._boxes) == ["left"], "the help promises a second axis for matrices of both kinds"
     press_box(panel)
     assert panel.export_arrays()[0].data.shape == (20, 5)
 

@@ -19,6 +19,7 @@ from escape_gui.panels.modes import ModesPanel
 from escape_gui.panels.psf import PsfPanel
 from escape_gui.views.images import mask_from_rows
 from escape_gui.widgets.controls import HOLD_MS
+from escape_gui.window.actions import help_page
 from escape_gui.window.camera_dialog import CameraDialog
 from escape_gui.window.offsets_dialog import OffsetsDialog
 from escape_hw.remote.state import ActiveRun, LoopState, Phase
@@ -213,6 +214,8 @@ def test_strokes_are_shown_in_nanometres_too(window: MainWindow, mirror: MirrorP
     assert mirror.readouts["peak"].text == "0.4120"
     assert mirror.readouts["peak_nm"].text == f"{0.412 * 3500:.0f}"
     assert "nm" in mirror.scale.text()
+    assert "as a fraction of its full stroke and in nanometres" in mirror.help
+    assert "per cent of" not in help_page(mirror)
 
 
 # ---------------------------------------------------------------- offsets

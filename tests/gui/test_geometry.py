@@ -16,7 +16,7 @@ from scripted import ScriptedSource
 from escape_gui.client.session import Session
 from escape_gui.main_window import MainWindow
 from escape_gui.settings import Settings
-from escape_gui.window.docks import WORKSPACES
+from escape_gui.window.docks import WORKSPACES, visible_sizes
 from escape_hw.api.registration import TO_STREAM_UNITS
 from escape_hw.io.documents import calibration_document
 from escape_hw.remote.state import (
@@ -95,6 +95,90 @@ def test_the_layout_of_a_wide_screen_fits_a_narrow_one(show: Show) -> None:
     check(window, 1016, 736)
 
 
+def in_front(window: MainWindow) -> set[str]:
+    return {name for name, dock in window.docks.items() if not dock.visibleRegion().isEmpty()}
+
+
+@pytest.mark.parametrize(
+    ("workspace", "more"),
+    [("align", set()), ("calibrate", {"log", "camera", "gains"}), ("operate", {"log", "mirror", "trends"})],
+)
+def test_a_large_window_shows_more_panels_at_once(workspace: str, more: set[str], show: Show) -> None:
+    window = show(Settings(workspace=workspace))
+    window.resize(1280, 760)
+    QApplication.processEvents()
+    before = in_front(window)
+    window.resize(2560, 1400)
+    for _ in range(5):
+        QApplication.processEvents()
+    assert (window.width(), window.height()) == (2560, 1400)
+    assert in_front(window) == before | more
+    window.resize(1280, 760)
+    for _ in range(5):
+        QApplication.processEvents()
+    assert in_front(window) == before
+    assert (window.width(), window.height()) == (1280, 760)
+
+
+def test_layouts_of_large_and_small_windows_are_kept_apart(show: Show, tmp_path) -> None:
+    window = show(Settings(workspace="operate"))
+    window.resize(2560, 1400)
+    for _ in range(5):
+        QApplication.processEvents()
+    widths = [window.docks[name].width() for name in ("loop", "performance", "camera")]
+    window.docks["mirror"].hide()
+    window.refresh()
+    for size in ((1280, 760), (2560, 1400)):
+        window.resize(*size)
+        for _ in range(5):
+            QApplication.processEvents()
+    assert not window.docks["mirror"].isVisible()
+    window.actions_by_name["reset_layout"].trigger()
+    QApplication.processEvents()
+    assert window.docks["mirror"].isVisible()
+    # As at first, not as it was squeezed into the small window.
+    again = [window.docks[name].width() for name in ("loop", "performance", "camera")]
+    assert again == pytest.approx(widths, rel=0.1)
+
+
+@pytest.mark.parametrize("workspace", [one.name for one in WORKSPACES])
+def test_a_layout_is_the_same_after_the_window_had_another_size(workspace: str, show: Show) -> None:
+    window = show(Settings(workspace=workspace))
+
+    def resize(width: int, height: int) -> None:
+        window.resize(width, height)
+        for _ in range(5):
+            QApplication.processEvents()
+        window.refresh()
+        assert (window.width(), window.height()) == (width, height)
+
+    for one, other in (((2560, 1400), (1024, 700)), ((1024, 700), (2560, 1400)), ((1600, 960), (2560, 1400))):
+        resize(*one)
+        window.reset_layout()
+        resize(*one)
+        before = visible_sizes(window.docks.values())
+        resize(*other)
+        resize(*one)
+        for dock in visible_sizes(window.docks.values()):
+            assert dock.width() == pytest.approx(before[dock].width(), rel=0.1), (one, dock.windowTitle())
+            assert dock.height() == pytest.approx(before[dock].height(), rel=0.1), (one, dock.windowTitle())
+
+
+@pytest.mark.parametrize("workspace", [one.name for one in WORKSPACES])
+def test_a_layout_is_scaled_to_a_window_that_was_large_meanwhile(workspace: str, show: Show) -> None:
+    window = show(Settings(workspace=workspace))
+    sizes = []
+    for size in ((1600, 960), (2560, 1400), (1200, 720)):
+        window.resize(*size)
+        for _ in range(5):
+            QApplication.processEvents()
+        window.refresh()
+        sizes.append(visible_sizes(window.docks.values()))
+    for dock, size in sizes[2].items():
+        assert size.width() == pytest.approx(0.75 * sizes[0][dock].width(), rel=0.15), dock.windowTitle()
+        assert size.height() == pytest.approx(0.72 * sizes[0][dock].height(), rel=0.15), dock.windowTitle()
+
+
 def wide_panels(window: MainWindow) -> set[str]:
     """Visible panels that do not fit the width of their dock."""
     areas = {name: dock.widget() for name, dock in window.docks.items() if not dock.visibleRegion().isEmpty()}
@@ -160,7 +244,9 @@ def test_buttons_that_are_held_are_visible_in_the_narrowest_window(
         window.update_timer.tick(force=True)
         QApplication.processEvents()
     if panel == "mirror":
-        found.poke_text.setText(f"Mirror flat again after: {found._plan.description}")
+        # The longest text, as while it is held.
+        found._show_poke(f"Held: {found._plan.description}")
         QApplication.processEvents()
+        assert found.poke_text.height() >= found.poke_text.heightForWidth(found.poke_text.width())
         assert found.image_view.geometry().bottom() < found.arm_button.geometry().top()
     assert_is_in_its_dock(getattr(window.panels[panel], button), window, panel)

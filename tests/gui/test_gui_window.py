@@ -23,6 +23,7 @@ from scripted import ScriptedControl, ScriptedSource
 
 from escape_gui.client.session import EmptySource, Session
 from escape_gui.main_window import MainWindow
+from escape_gui.panels.base import ENGINE_ENDED_TEXT
 from escape_gui.panels.procedure import ProcedurePanel
 from escape_gui.settings import Settings, load_settings
 from escape_gui.widgets.controls import Level
@@ -301,11 +302,21 @@ def test_after_the_end_of_the_engine_nothing_stale_is_shown(
     assert header.phase.text == "fault"
     assert {one.text for one in header.readouts.values()} == {"–"}
     assert header.saturation.text == "saturated –"
+    for name in ("camera", "psf", "mirror"):
+        panel = window.panels[name]
+        # The scripted streams still have samples; those of a server end with its engine.
+        panel.reset()
+        source.streams.clear()
+        panel.refresh_from(source)
+        assert panel.shows_placeholder
+        assert panel._placeholder_label.text() == ENGINE_ENDED_TEXT
     window.show_workspace("calibrate")
     window.update_timer.tick(force=True)
     loop, procedure = window.panels["loop"], window.panels["procedure"]
     loop.on_state(source.state)
     loop.tick(source)
+    assert {one.text() for one in loop.current.values()} == {"–"}
+    assert not loop.modes.text()
     for button in (loop.close_button, procedure.start, procedure.check, window.actions_by_name["record"]):
         assert not button.isEnabled()
         assert "the engine has ended; clear the fault to start it again" in button.toolTip()

@@ -106,6 +106,8 @@ def test_trends_are_drawn_over_hours_and_over_nights(
     make_window, source: ScriptedSource, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ):
     monkeypatch.setattr("escape_gui.panels.trends.runs_folder", lambda session: tmp_path)
+    # One night, also at noon, when the next one begins.
+    monkeypatch.setattr("escape_gui.panels.trends.night_of", lambda time: "2026-11-22")
     window: MainWindow = make_window((TrendsPanel,))
     panel = window.panels["trends"]
     assert isinstance(panel, TrendsPanel)
@@ -120,6 +122,8 @@ def test_trends_are_drawn_over_hours_and_over_nights(
     assert panel.readouts["strength"].text == "22"
     assert panel.readouts["r0_m"].text == "0.22 mm"
     assert panel.missing.text() == "not measured: registration, optical gain"
+    numbers = [plot.getAxis("left").style["showValues"] for plot in panel.plot._plots]
+    assert numbers == [True, True, False, False], "an axis without data has no numbers"
     assert [one.name for one in panel.export_arrays()] == ["strehl", "strength"]
     panel.span.choose("Nights")
     wait_for(lambda: panel.missing.text().startswith("1 nights"))

@@ -91,6 +91,23 @@ def test_a_recording_of_some_seconds_is_requested_grows_and_is_analysed(
     assert "no modes without correction" in panel.source_label.text()
 
 
+def test_a_recording_of_a_hidden_panel_is_analysed_when_it_is_shown(
+    window: MainWindow, panel: TelemetryPanel, source: ScriptedSource, runs: Path
+):
+    folder = record(runs / "2026-11-22" / "213000_telemetry")
+    ended = RecordingState(recording=False, path=str(folder), written=3072, started_utc=format_utc())
+    source.change(recording=ended)
+    window.update_timer.tick(force=True)
+    wait_for(lambda: "1,024 frames, 2.0 s" in panel.source_label.text())
+    # Another one that the operator opens stays.
+    other = record(runs / "2026-11-22" / "214000_telemetry")
+    panel.open_recording(other)
+    wait_for(lambda: panel._folder == other)
+    source.change(recording=ended)
+    window.update_timer.tick(force=True)
+    assert not panel._busy
+
+
 def test_all_views_show_the_analysis_in_both_themes(
     window: MainWindow, panel: TelemetryPanel, source: ScriptedSource, runs: Path
 ):

@@ -15,6 +15,7 @@ from escape_hw.errors import CalibrationError, RequestRefused, ServerGone
 from escape_hw.io.fits.matrix import load_matrix
 from escape_hw.remote.address import ServerListing, local_endpoint, register_server, unregister_server
 from escape_hw.remote.state import Phase
+from escape_hw.server.frontend.supervisor import _NUMBERS_OF_A_FRONT_END
 from escape_hw.streams.segments import segments
 from escape_hw.supervision import process_start
 
@@ -43,6 +44,10 @@ def test_the_fail_safe_process_flattens_the_mirror_of_a_killed_engine(system, be
         kept = load_state_frames(state)
         result = client.calibrate("docrime", resume=str(state.parent), frames=kept + 500)
         assert result.frames == kept + 500
+        # The log goes on over the end of the engine, without a gap.
+        lines = client.log_after(-1)
+        assert [line.number for line in lines] == list(range(len(lines)))
+        assert sum("process" in line.text and "engine of" in line.text for line in lines) == 2
     assert spy.flat
 
 
@@ -120,6 +125,9 @@ def test_a_front_that_was_killed_leaves_a_flat_mirror_and_a_note(system, bench, 
                 lambda: any("run 2: " in line.text for line in client.log_after(-1)), "its line of the log"
             )
             client.abort()
+            # Nothing that the other front end wrote is missing, also before this client was connected again.
+            lines = [line for line in client.log_after(-1) if line.number >= _NUMBERS_OF_A_FRONT_END]
+            assert [line.number - _NUMBERS_OF_A_FRONT_END for line in lines] == list(range(len(lines)))
         assert seconds < 30
         # The engine had the time to keep what was measured.
         (partial,) = tmp_path.rglob("im.partial.fits")

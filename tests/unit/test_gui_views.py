@@ -203,6 +203,10 @@ def test_progress_as_text():
     assert form.progress_line(endless) == "DO-CRIME: 610 frames"
     assert form.worst_mode(np.array([5.0, 3.1, np.nan, np.inf])) == "worst mode 2: SNR 3.1"
     assert form.worst_mode(np.array([np.nan])) == ""
+    aborted = FinishedRun(
+        id=1, name="escape", finish=Finish.ABORTED, message="stopped; the data measured so far are saved"
+    )
+    assert form.result_line(aborted) == "Aborted: escape. stopped; the data measured so far are saved"
     failed = FinishedRun(id=1, name="escape", finish=Finish.FAILED, message="too dark")
     assert form.result_line(failed) == "Failed: escape. too dark"
 
@@ -226,7 +230,7 @@ def test_results_of_every_procedure_are_stated_in_numbers():
         "Gain of the loop: 0.4 (before: 0.4)",
         "Residual: 44.2 nm rms (before: 44.2 nm rms)",
         "Strehl ratio: 36.5 % (before: 30.0 %)",
-        "Frames: 2000, 4.0 s (simulated), 3 lost",
+        "Frames measured: 2000, 4.0 s (simulated), 3 lost",
     ]
     gains = {"optical_gain": [0.5, 0.7], "exchanges": [{"accepted": True}, {}], "alarms": [{}]}
     assert form.comparison_lines(gains, None) == [
@@ -238,9 +242,9 @@ def test_results_of_every_procedure_are_stated_in_numbers():
 
 def test_rates_of_a_twin_are_marked():
     plan = ProcedurePlan(name="docrime", arguments={}, frames=1000, seconds=2.0, stroke=0.02)
-    assert form.plan_lines(plan)[0] == "1000 frames, 2.0 s at the camera's frame rate"
+    assert form.plan_lines(plan)[0] == "1000 sensor frames; 2.0 s at the camera's frame rate"
     simulated = form.plan_lines(plan, simulated=True)
-    assert simulated[0] == "1000 frames, 2.0 s at the simulated frame rate of the camera"
+    assert simulated[0] == "1000 sensor frames; 2.0 s at the simulated frame rate of the camera"
 
 
 def test_the_newest_matrix_is_offered_first():

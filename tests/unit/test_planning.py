@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 from small_system import SMALL
 
+from escape_gui.views.procedure_form import comparison_lines, plan_lines
 from escape_hw.api.procedure import run
 from escape_hw.bench import Bench
 from escape_hw.calibration.acquisition.pokes import RandomPokes, compute_poke_amplitudes
 from escape_hw.calibration.docrime.open_loop import docrime
 from escape_hw.calibration.modes.bases import build_modal_basis
+from escape_hw.calibration.push_pull.modulation import modulation_demodulation
 from escape_hw.config.loader import load_system
 from escape_hw.io.documents import calibration_document
 from escape_hw.server.engine.procedures import ProcedurePlanner
@@ -70,3 +72,28 @@ def test_the_model_psf_takes_the_time_of_the_science_camera(bench: Bench) -> Non
     plan = ProcedurePlanner(bench).plan("model-psf", {"frames": 20})
     assert bench.science is not None
     assert plan.seconds == pytest.approx(20 / bench.science.settings.frame_rate_hz, rel=0.05)
+
+
+def test_frames_of_a_plan_are_those_of_its_preparation_and_of_the_result(bench: Bench) -> None:
+    plan = ProcedurePlanner(bench).plan("modulated", {"frames": 300})
+    result = run(modulation_demodulation(bench, frames=300))
+    assert plan.preparation_frames == 200
+    assert plan.frames == 200 + result.frames + result.lost_frames
+    first = plan_lines(plan, simulated=True)[0]
+    assert first.startswith(f"{plan.frames} sensor frames, 200 of them to prepare; ")
+    measured = comparison_lines(calibration_document(result), None)[-1]
+    assert measured.startswith(f"Frames measured: {result.frames}, ")
+
+
+def test_a_push_pull_prepares_with_set_up_and_test_step(bench: Bench) -> None:
+    plan = ProcedurePlanner(bench).plan("push-pull", {"frames": 3})
+    assert plan.preparation_frames == 240
+    assert plan.frames == 240 + 30 * 2 * (3 + 2)
+
+
+def test_a_loop_prepares_with_the_model_psf(bench: Bench) -> None:
+    planner, frames = ProcedurePlanner(bench), {"frames": 500}
+    psf = planner.plan("model-psf", {"frames": 20}).frames
+    plan = planner.plan("loop", {**frames, "strehl": True})
+    assert (plan.frames, plan.preparation_frames) == (500 + psf, psf)
+    assert planner.plan("loop", {**frames, "strehl": False}).preparation_frames == 0

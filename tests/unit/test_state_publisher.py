@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -49,3 +49,16 @@ def test_the_number_of_flattenings_is_in_the_state() -> None:
     sequence = MirrorSequence()
     sequence.dm.flatten_count = 3
     assert sequence.state_publisher._mirror().flatten_count == 3
+
+
+def test_a_run_that_does_not_read_the_sensor_loses_no_frames() -> None:
+    """The model PSF: the sensor's camera goes on, and nobody reads it."""
+    wfs = SimpleNamespace(is_open=True, status=lambda: SimpleNamespace(lost=wfs.lost), lost=0)
+    bench, publisher, nothing = (
+        cast(Any, one) for one in (SimpleNamespace(wfs=wfs), SimpleNamespace(), None)
+    )
+    state_publisher = StatePublisher(bench, nothing, publisher, nothing, Path(), lambda state: None)
+    run: Any = SimpleNamespace(loop_control=None, active_run="model-psf")
+    for frames, lost, shown in ((500, 2, 2), (500, 80, 2), (501, 81, 81)):
+        publisher.frames, wfs.lost = frames, lost
+        assert state_publisher._frame_counters(None, run).lost_frames == shown

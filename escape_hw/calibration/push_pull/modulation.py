@@ -29,7 +29,7 @@ from escape_hw.io.fits.run_state import RunState
 #: at which the mirror hardly responds.
 BAND = (0.1, 0.4)
 #: Frames at the start of a batch in which the motion of the mirror settles.
-_SETTLING_FRAMES = 10
+SETTLING_FRAMES = 10
 #: Least mean squared ratio of the elements to their standard errors; 1 for noise alone.
 _MIN_MEAN_POWER = 2.0
 
@@ -108,7 +108,7 @@ class _ModulationRun(ModeByModeRun):
 
     def prepare(self) -> Procedure[Reporter]:
         yield from ()
-        return Reporter("modulation", self.n_steps * (self.frames + _SETTLING_FRAMES))
+        return Reporter("modulation", self.n_steps * (self.frames + SETTLING_FRAMES))
 
     def measure_step(self, step: int) -> Procedure[Measurement]:
         """Drive the modes of a batch and fit their lines ``(n_slopes, n)``."""
@@ -116,7 +116,7 @@ class _ModulationRun(ModeByModeRun):
         m2c, amplitude = self.m2c[:, self._batches[step]], self.amplitude[self._batches[step]]
         # Quadratic phases minimise the peak of the sum of many sinusoids (Schroeder 1970).
         phase = np.pi * np.arange(amplitude.size) ** 2 / amplitude.size
-        n_shapes = self.frames + _SETTLING_FRAMES
+        n_shapes = self.frames + SETTLING_FRAMES
         sinusoids = amplitude * np.sin(np.outer(np.arange(n_shapes), frequency) + phase)
         shapes = sinusoids @ m2c.T
         scale = _amplitude_scale(bench, shapes)
@@ -138,7 +138,7 @@ class _ModulationRun(ModeByModeRun):
                 yield progress
         bench.dm.flatten()
         at = np.array(times, np.int64)
-        settled = at >= _SETTLING_FRAMES
+        settled = at >= SETTLING_FRAMES
         lines = fit_lines(
             at[settled], np.stack(slope_rows)[settled], frequency, amplitude * scale, self.frames
         )

@@ -21,6 +21,8 @@ from escape_hw.io.fits.run_state import RunState
 
 #: Frames after a test step from which the settling time is found.
 _STEP_FRAMES = 30
+#: Frames of the test step, with those before it.
+TEST_STEP_FRAMES = _STEP_FRAMES // 3 + _STEP_FRAMES
 #: Relative deviation from the final response below which it has settled.
 _SETTLED_FRACTION = 0.02
 #: Relative scatter of the final response above which there is none.

@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     from escape_hw.runtime.session.record import BenchRecord
 
 
-#: Frames of the settling test before a push-pull, and frames discarded after each push and pull.
-_SETTLING_TEST_FRAMES, _SETTLING_FRAMES = 50, 2
+#: Frames that a plan expects to be discarded after each push and pull.
+_SETTLING_FRAMES = 2
 
 
 def _frames(config_key: str, help: str = "Frames to measure with.") -> Any:
@@ -295,12 +295,18 @@ class PushPullProcedure(CalibrationProcedure):
     poke: float | None = _poke("calibration.push_pull_poke")
 
     @classmethod
-    def planned_frames(cls, bench: Bench, arguments: Mapping[str, Any]) -> int:
-        """Frames of set-up, settling test, and a push and a pull per mode."""
+    def preparation_frames(cls, bench: Bench, arguments: Mapping[str, Any]) -> int:
+        """Frames of set-up and settling test."""
         from escape_hw.calibration.acquisition.sensor_setup import SETUP_FRAMES
+        from escape_hw.calibration.push_pull.procedure import TEST_STEP_FRAMES
 
+        return SETUP_FRAMES + TEST_STEP_FRAMES
+
+    @classmethod
+    def planned_frames(cls, bench: Bench, arguments: Mapping[str, Any]) -> int:
+        """Frames of the preparation, and of a push and a pull per mode."""
         per_mode = 2 * (int(arguments.get("frames") or 0) + _SETTLING_FRAMES)
-        return SETUP_FRAMES + _SETTLING_TEST_FRAMES + bench.config.basis.n_modes * per_mode
+        return cls.preparation_frames(bench, arguments) + bench.config.basis.n_modes * per_mode
 
 
 class FastPushPullProcedure(ClosedLoopCalibration):
@@ -323,19 +329,26 @@ class ModulatedProcedure(CalibrationProcedure):
     frames: int | None = _frames("calibration.modulated_frames", "Frames per batch of modes.")
 
     @classmethod
+    def preparation_frames(cls, bench: Bench, arguments: Mapping[str, Any]) -> int:
+        """Frames of the set-up."""
+        from escape_hw.calibration.acquisition.sensor_setup import SETUP_FRAMES
+
+        return SETUP_FRAMES
+
+    @classmethod
     def planned_frames(cls, bench: Bench, arguments: Mapping[str, Any]) -> int:
         """Frames of the set-up and of all batches."""
-        from escape_hw.calibration.acquisition.sensor_setup import SETUP_FRAMES
         from escape_hw.calibration.push_pull.demodulation import choose_line_frequencies
-        from escape_hw.calibration.push_pull.modulation import BAND
+        from escape_hw.calibration.push_pull.modulation import BAND, SETTLING_FRAMES
         from escape_hw.errors import TooFewFrames
 
         frames, n_modes = int(arguments.get("frames") or 0), bench.config.basis.n_modes
+        prepare = cls.preparation_frames(bench, arguments)
         try:
             at_once = choose_line_frequencies(n_modes, frames, BAND).size
         except TooFewFrames:
-            return SETUP_FRAMES + frames
-        return SETUP_FRAMES + -(-n_modes // at_once) * frames
+            return prepare + frames
+        return prepare + -(-n_modes // at_once) * (frames + SETTLING_FRAMES)
 
 
 #: The calibrations by method.

@@ -245,9 +245,14 @@ class ProcedureSpec(ABC, Generic[ResultT]):
         return cls.closes_loop or arguments.get("closed_loop") is not None
 
     @classmethod
+    def preparation_frames(cls, bench: Bench, arguments: Mapping[str, Any]) -> int:
+        """Sensor frames that a run takes before it measures, and does not count in its result."""
+        return 0
+
+    @classmethod
     def planned_frames(cls, bench: Bench, arguments: Mapping[str, Any]) -> int:
-        """Number of sensor frames that a run takes; ``arguments`` are complete."""
-        return int(arguments.get("frames") or 0)
+        """Sensor frames that a run takes, with those of its preparation; ``arguments`` are complete."""
+        return cls.preparation_frames(bench, arguments) + int(arguments.get("frames") or 0)
 
     def validate(self) -> None:
         """Check values that depend on each other.

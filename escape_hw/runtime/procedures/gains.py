@@ -10,7 +10,6 @@ from escape_hw.runtime.procedures.declaration import SavedRun, parameter
 from escape_hw.runtime.procedures.matrix_input import (
     MatrixProcedure,
     load_fitting_matrix,
-    psf_frames,
     require_hardware_matrix,
 )
 
@@ -62,7 +61,7 @@ class GainsProcedure(MatrixProcedure["GainsRun"]):
     @classmethod
     def planned_frames(cls, bench: Bench, arguments: Mapping[str, Any]) -> int:
         """Sensor frames of the model PSF and of a typical number of rounds."""
-        return psf_frames(bench, arguments) + _TYPICAL_ROUNDS * int(arguments.get("frames") or 0)
+        return cls.preparation_frames(bench, arguments) + _TYPICAL_ROUNDS * int(arguments.get("frames") or 0)
 
     def load(self, config: SystemConfig, simulated: bool = False) -> None:
         """Read all matrices."""

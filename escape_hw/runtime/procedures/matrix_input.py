@@ -119,14 +119,9 @@ class MatrixProcedure(ProcedureSpec[ResultT]):
         return (yield from model_psf(bench))
 
     @classmethod
-    def planned_frames(cls, bench: Bench, arguments: Mapping[str, Any]) -> int:
-        """Sensor frames while the model PSF is measured, and those of the loop."""
-        return psf_frames(bench, arguments) + super().planned_frames(bench, arguments)
-
-
-def psf_frames(bench: Bench, arguments: Mapping[str, Any]) -> int:
-    """Sensor frames that pass while the model PSF is measured; 0 if it is not."""
-    if not arguments.get("strehl") or bench.science is None:
-        return 0
-    rate = bench.wfs.settings.frame_rate_hz
-    return math.ceil(MODEL_PSF_FRAMES * rate / bench.science.settings.frame_rate_hz)
+    def preparation_frames(cls, bench: Bench, arguments: Mapping[str, Any]) -> int:
+        """Sensor frames that pass while the model PSF is measured; 0 if it is not."""
+        if not arguments.get("strehl") or bench.science is None:
+            return 0
+        rate = bench.wfs.settings.frame_rate_hz
+        return math.ceil(MODEL_PSF_FRAMES * rate / bench.science.settings.frame_rate_hz)

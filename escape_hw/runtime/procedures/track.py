@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from escape_hw.runtime.procedures.declaration import SavedRun, parameter
-from escape_hw.runtime.procedures.matrix_input import MatrixProcedure, psf_frames, require_hardware_matrix
+from escape_hw.runtime.procedures.matrix_input import MatrixProcedure, require_hardware_matrix
 
 if TYPE_CHECKING:
     from escape_hw.api.procedure import Procedure
@@ -57,7 +57,7 @@ class TrackProcedure(MatrixProcedure["TrackResult"]):
     def planned_frames(cls, bench: Bench, arguments: Mapping[str, Any]) -> int:
         """Sensor frames of the model PSF and of the given duration."""
         duration = math.ceil(float(arguments.get("seconds") or 0.0) * bench.wfs.settings.frame_rate_hz)
-        return psf_frames(bench, arguments) + duration
+        return cls.preparation_frames(bench, arguments) + duration
 
     def load(self, config: SystemConfig, simulated: bool = False) -> None:
         """Read the matrix."""

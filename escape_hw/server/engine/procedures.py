@@ -128,6 +128,7 @@ class ProcedurePlanner:
         stroke, clipped_share = self._simulate_pokes(name, arguments)
         return ProcedurePlan(
             name=name, arguments=dict(arguments), frames=frames, seconds=frames / rate, stroke=stroke,
+            preparation_frames=procedure.preparation_frames(self._bench, arguments),
             warnings=tuple(self._warnings(name, arguments, clipped_share)),
         )  # fmt: skip
 

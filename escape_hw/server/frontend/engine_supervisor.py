@@ -25,6 +25,7 @@ from escape_hw.server.frontend.engine_process import STOP_TIMEOUT_S, EngineProce
 from escape_hw.server.frontend.lease import LeaseManager
 from escape_hw.server.frontend.transport import ZmqTransport
 from escape_hw.server.ipc.channel import EngineSetup
+from escape_hw.server.ipc.log import ServerLog
 from escape_hw.server.safety.journal import ServerJournal
 from escape_hw.server.safety.watchdog import Watchdog
 
@@ -34,8 +35,10 @@ log = logging.getLogger(__name__)
 class PublishedState:
     """Holds and publishes the state; its ``notes`` stay."""
 
-    def __init__(self, state: State, leases: LeaseManager, transport: ZmqTransport) -> None:
-        self.state, self._leases, self._transport = state, leases, transport
+    def __init__(
+        self, state: State, leases: LeaseManager, transport: ZmqTransport, server_log: ServerLog
+    ) -> None:
+        self.state, self._leases, self._transport, self._log = state, leases, transport, server_log
         #: Number of the newest entry of the night log.
         self.last_night_entry = -1
 
@@ -48,6 +51,7 @@ class PublishedState:
                 "clients": self._leases.count, "refused_requests": self._transport.refused,
                 "notes": before.notes, "unattended_for_s": self._leases.seconds_without_holder(),
                 "unattended_limit_s": before.unattended_limit_s, "last_night_entry": self.last_night_entry,
+                "last_log_line": self._log.last_number,
             }
         )  # fmt: skip
         self._transport.publish("state", self.state)

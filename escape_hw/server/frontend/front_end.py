@@ -69,7 +69,7 @@ class FrontEnd:
             system=config.system.name, simulated=config.simulated, seed=config.system.seed,
             notes=self._journal.read_previous_end(), unattended_limit_s=config.server.unattended_s,
         )  # fmt: skip
-        self._published = PublishedState(state, self._leases, transport)
+        self._published = PublishedState(state, self._leases, transport, self._log)
         self._night_log = NightLog(config, runs, self._publish_night_entry)
         self._night_log.start(state.notes)
         #: Requests that the engine has not answered yet, and when they were forwarded (monotonic seconds).
@@ -104,6 +104,7 @@ class FrontEnd:
                     supervisor.receive_messages(engine)
                 for incoming in self._transport.receive_requests():
                     self._handle_request(incoming)
+                self._log.flush()
                 self._leases.expire()
                 self._night_log.update(self._published.state)
                 supervisor.check(self._oldest_safety_request_s())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import logging.handlers
+import threading
 from collections import deque
 from collections.abc import Callable
 from datetime import UTC, datetime
@@ -49,12 +50,18 @@ def forward_log(forward: Callable[[LogLine], object]) -> LogForwarder:
 
 
 class ServerLog:
-    """Numbers, stores and publishes the lines of front end and engine."""
+    """Numbers, stores and publishes the lines of front end and engine, in the thread that creates it.
+
+    Lines of other threads, for example that of the check of keys, wait for :meth:`flush`.
+    """
 
     def __init__(self, path: Path, publish: Callable[[LogLine], object], first_number: int = 0) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         self._lines: deque[LogLine] = deque(maxlen=_LINES)
         self._next, self._publish = first_number, publish
+        self._thread, self._waiting = threading.get_ident(), deque[LogLine]()
+        #: Number of the newest line; -1 if there is none.
+        self.last_number = -1
         self._file = logging.handlers.RotatingFileHandler(
             path, maxBytes=_BYTES, backupCount=_FILES, encoding="utf-8"
         )
@@ -63,8 +70,18 @@ class ServerLog:
 
     def add(self, line: LogLine) -> None:
         """Add a line of this process or the engine."""
+        self._waiting.append(line)
+        if threading.get_ident() == self._thread:
+            self.flush()
+
+    def flush(self) -> None:
+        """Number and publish the lines that other threads have added."""
+        while self._waiting:
+            self._add(self._waiting.popleft())
+
+    def _add(self, line: LogLine) -> None:
         line = line.model_copy(update={"number": self._next})
-        self._next += 1
+        self.last_number, self._next = self._next, self._next + 1
         self._lines.append(line)
         text = f"{line.at_utc} {line.level} {line.logger}: {line.text}"
         self._file.emit(logging.LogRecord(line.logger, logging.INFO, "", 0, text, None, None))
@@ -79,4 +96,5 @@ class ServerLog:
         for name in _PACKAGES:
             logging.getLogger(name).removeHandler(self._handler)
         logging.getLogger("escape_hw").setLevel(self._level)
+        self.flush()
         self._file.close()
