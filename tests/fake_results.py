@@ -41,7 +41,7 @@ def grid(n: int = 24, seed: int = 0) -> SubApertureGrid:
     valid = x**2 + y**2 < (n / 2) ** 2
     references = rng.normal(0, 0.3, (int(valid.sum()), 2)).astype(np.float32)
     return SubApertureGrid(
-        15.55, (21.3, 19.8), valid, references, flux * valid, 3426.0, 1.1, 7.9, 0.8, 0.02, 1.1, 0.16
+        15.55, (21.3, 19.8), valid, references, flux * valid, 3426.0, 1.1, 7.9, 0.8, 0.02, 1.1
     )
 
 

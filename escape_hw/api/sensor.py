@@ -92,16 +92,6 @@ class SensorGeometry(abc.ABC):
             Fraction of the slope variance that is correlated over two frames; 0 if unknown.
         """
 
-    def with_temporal_response(self, weights: NDArray[np.float64]) -> Self:
-        """The geometry with what a model needs of the temporal response; by default nothing.
-
-        Parameters
-        ----------
-        weights
-            Share of the final response in each frame after a command ``(lags,)``, of sum 1.
-        """
-        return self
-
     @abc.abstractmethod
     def with_mean_slopes(self, mean: NDArray[np.float64]) -> Self:
         """The geometry with references from a longer average over the turbulence.
@@ -176,8 +166,6 @@ class SubApertureGrid(SensorGeometry):
         Rms surface of the random pokes, all modes, as fraction of full stroke; 0 without random pokes.
     pixel_noise
         Rms noise of a pixel without light in one frame, in counts; 0 if unknown.
-    previous_share
-        Share of an exposure that sees the previous random poke instead of the present one; 0 if unknown.
     """
 
     kind: ClassVar[str] = "shack-hartmann"
@@ -199,7 +187,6 @@ class SubApertureGrid(SensorGeometry):
     turbulence_px: float = 0.0
     pokes: float = 0.0
     pixel_noise: float = 0.0
-    previous_share: float = 0.0
     __repr__ = short_repr
 
     def centres_px(self) -> NDArray[np.float64]:
@@ -227,15 +214,6 @@ class SubApertureGrid(SensorGeometry):
         """
         turbulence = rms * float(np.sqrt(persistent_fraction)) if persistent_fraction else self.turbulence_px
         return replace(self, motion_px=rms, turbulence_px=turbulence, pokes=pokes)
-
-    def with_temporal_response(self, weights: NDArray[np.float64]) -> SubApertureGrid:
-        """See :meth:`SensorGeometry.with_temporal_response`.
-
-        Two pokes in an exposure, of which each frame has a new one, have the variance ``(1 - q)^2 + q^2``
-        that the weights of all lags give.
-        """
-        variance = min(1.0, max(0.5, float(np.square(weights).sum())))
-        return replace(self, previous_share=(1 - float(np.sqrt(2 * variance - 1))) / 2)
 
     def with_mean_slopes(self, mean: NDArray[np.float64]) -> SubApertureGrid:
         """See :meth:`SensorGeometry.with_mean_slopes`; fits a regular lattice to the mean spots.

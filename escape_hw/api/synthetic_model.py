@@ -169,14 +169,6 @@ class HasPokeResponse(Protocol):
 
 
 @runtime_checkable
-class DependsOnResponse(Protocol):
-    """A model whose spatial response depends on how the exposures mix the random pokes."""
-
-    def with_temporal_response(self, weights: NDArray[np.float64]) -> SyntheticModel:
-        """The model for a temporal response ``(lags,)`` of sum 1."""
-
-
-@runtime_checkable
 class DifferentiableModel(SyntheticModel, Protocol):
     """A synthetic model with modal matrices and analytic derivatives.
 

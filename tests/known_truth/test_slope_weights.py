@@ -157,31 +157,6 @@ def test_motion_averages_over_where_the_spots_are(config, motion_px):
     assert np.linalg.norm(still - want) > 0.02 * size
 
 
-def test_an_exposure_that_sees_two_pokes_adds_their_images(config):
-    """The spots move apart by two independent pokes; the path of the derivative is there all the time."""
-    grid, cut = with_counts(config)
-    q, motion_px = 0.25, 1.1
-    grid = replace(grid, motion_px=motion_px, turbulence_px=0.0, pokes=0.02, previous_share=q)
-    truth, shape = Truth(config, grid, cut), surfaces(config, MOVED)[48]
-    opd = STEP * 2 * config.devices.dm.stroke_m * shape
-    # The rms of the mean of both is the measured motion.
-    one_poke = motion_px / np.hypot(1 - q, q)
-    now = one_poke * lattice(144, 89)
-    previous = np.random.default_rng(0).permutation(now)
-
-    def both(a, b, change):
-        images = (truth.image(truth.tilt(*at) + change) for at in (a, b))
-        return truth.slopes_of(sum(share * image for share, image in zip((1 - q, q), images, strict=True)))
-
-    pairs = list(zip(now, previous, strict=True))
-    want = np.mean([(both(a, b, opd) - both(a, b, -opd)) / (2 * STEP) for a, b in pairs], axis=0)
-    found = ShackHartmannModel(config, grid).zonal_matrix(MOVED)[:, 48]
-    single = ShackHartmannModel(config, replace(grid, previous_share=0.0)).zonal_matrix(MOVED)[:, 48]
-    # Over all slopes, which averages the pattern of the nodes.
-    assert found @ want == pytest.approx(want @ want, rel=0.002)
-    assert single @ want < 0.995 * (want @ want)
-
-
 def test_noise_makes_the_threshold_gradual(config):
     grid, cut = with_counts(config)
     counts_per_light = config.sensor.threshold * 1023 / cut

@@ -70,12 +70,6 @@ def test_a_resumed_run_gives_the_same() -> None:
     assert other.persistent_fraction == pytest.approx(one.persistent_fraction, abs=0.02)
 
 
-@pytest.mark.parametrize("share", [0.0, 0.16, 0.5])
-def test_the_temporal_response_gives_the_share_of_the_previous_poke(share: float) -> None:
-    lenslets = fake.grid(8).with_temporal_response(np.array([0.0, 0.0, 1 - share, share, 0.0]))
-    assert lenslets.previous_share == pytest.approx(share)
-
-
 def test_a_closed_loop_gives_no_turbulence_within_a_lenslet() -> None:
     rng, lenslets = np.random.default_rng(3), fake.grid(8)
     slope_statistics, slopes = SlopeStatistics(lenslets.n_slopes), np.zeros(lenslets.n_slopes)

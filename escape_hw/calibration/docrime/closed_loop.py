@@ -186,8 +186,8 @@ def docrime_closed_run(
     if skipped:
         notes.append(f"the estimate skipped {skipped} frames, because its sums were behind the loop")
     result = CalibrationResult(
-        matrix, acquisition.grid.with_temporal_response(solution.response.weights), solution.frames,
-        solution.lost_frames, seconds, solution.response, partial=partial, notes=tuple(notes),
+        matrix, acquisition.grid, solution.frames, solution.lost_frames, seconds, solution.response,
+        partial=partial, notes=tuple(notes),
     )  # fmt: skip
     return DocrimeRun(result, solution)
 

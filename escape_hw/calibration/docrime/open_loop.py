@@ -172,7 +172,7 @@ def _result(
     seconds = (solution.frames + solution.lost_frames) / acquisition.bench.wfs.settings.frame_rate_hz
     return CalibrationResult(
         matrix,
-        acquisition.build_final_geometry().with_temporal_response(solution.response.weights),
+        acquisition.build_final_geometry(),
         solution.frames,
         solution.lost_frames,
         seconds,

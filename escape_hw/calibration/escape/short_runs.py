@@ -93,7 +93,7 @@ def calibrate_short_run(
     )  # fmt: skip
     return replace(
         result,
-        grid=acquisition.build_final_geometry().with_temporal_response(fit.response.weights),
+        grid=acquisition.build_final_geometry(),
         mean_frame=sensor.mean_frame,
         notes=(*result.notes, *acquisition.notes()),
     )
@@ -136,7 +136,6 @@ def _build_result(
     shortened: int,
 ) -> CalibrationResult:
     """Calibration with the pseudo-synthetic matrix of a fit; ``shortened`` counts limited commands."""
-    grid = grid.with_temporal_response(fit.response.weights)
     synthetic = synthesise_calibration(bench, grid, fit.estimate, m2c)
     metrics = {
         **synthetic.matrix.metrics, "frames": frames, "lost_frames": lost, "poke": poke,
@@ -196,7 +195,6 @@ def calibrate_short_run_closed_loop(
         order=order, shortened=loop.record.shortened,
     )  # fmt: skip
     notes = collect_loop_notes(loop.record, bench.wfs.settings.frame_rate_hz)
-    geometry = geometry.with_temporal_response(fit.response.weights)
     return replace(result, grid=geometry, notes=(*result.notes, *notes))
 
 

@@ -19,7 +19,7 @@ from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.procedure import Procedure
 from escape_hw.api.registration import Registration
 from escape_hw.api.results import RegistrationEstimate, TemporalResponse
-from escape_hw.api.synthetic_model import DependsOnResponse, SyntheticModel
+from escape_hw.api.synthetic_model import SyntheticModel
 from escape_hw.calibration.acquisition.aligned_telemetry import AlignedTelemetry
 from escape_hw.calibration.docrime.regression import (
     MAX_CORRELATED_SLOPES,
@@ -177,8 +177,6 @@ def fit_telemetry(
             response = _initial_response(frames)
         else:
             response = _estimate_response(frames, matrix, known_response)
-            if number <= 1 and isinstance(model, DependsOnResponse):
-                model = model.with_temporal_response(response.weights)
             residual = slopes - frames.delayed_commands(response.weights) @ matrix.T
         degrees_of_freedom = max(n - 1 - n_effective_parameters / slopes.shape[1], 1.0)
         variance = np.square(residual).sum(axis=0) / degrees_of_freedom

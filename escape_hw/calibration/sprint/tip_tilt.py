@@ -90,7 +90,7 @@ class TipTiltFreeModel:
 
     def __getattr__(self, name: str) -> Any:
         attribute = getattr(self._model, name)
-        if name not in ("with_pupil_shift", "around_pokes", "with_temporal_response"):
+        if name not in ("with_pupil_shift", "around_pokes"):
             return attribute
 
         def treated_alike(*arguments: Any) -> TipTiltFreeModel | None:

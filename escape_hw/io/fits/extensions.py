@@ -33,7 +33,7 @@ _COMMON_CARDS = {"COUNTS": "counts", "BACKGND": "background"}
 _CARDS: dict[str, dict[str, str]] = {
     SubApertureGrid.kind: {
         "PITCH": "pitch_px", "MOTION": "motion_px", "AIR": "turbulence_px", "POKES": "pokes",
-        "NOISE": "pixel_noise", "PREVIOUS": "previous_share", **_COMMON_CARDS,
+        "NOISE": "pixel_noise", **_COMMON_CARDS,
     },
     PyramidPupils.kind: {
         "DIAMETER": "diameter_px", "MOTION": "motion", "CENTRESD": "centre_sigma_px", "POKES": "pokes",

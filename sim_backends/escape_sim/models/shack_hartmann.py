@@ -68,9 +68,6 @@ def slope_weights(
     these as well: each is added to a spot motion. Pokes of a mirror with about one actuator per lenslet are
     not tilts of whole lenslets (docs/studies/lenslet-pokes.md).
 
-    An exposure that sees two pokes, ``grid.previous_share`` of it the previous one, adds two images, and the
-    derivative is by a path that is on the lenslets during both.
-
     Returns
     -------
     dict
@@ -79,46 +76,20 @@ def slope_weights(
     is_mean = grid.motion_px > 0 or len(wavefronts_m) > 0
     window_images = _WindowImages(config, grid, pupil, is_mean=is_mean)
     wave = 2 * np.pi / config.system.wavelength_m
-    exposures = (
-        _spot_motion(grid, has_wavefronts=len(wavefronts_m) > 0) if is_mean else [(1.0, np.zeros((1, 2)))]
-    )
-    n_nodes = len(exposures[0][1])
-    blur = np.zeros((n_nodes, pupil.n_pix, pupil.n_pix))
+    shifts = grid.motion_px * gaussian_lattice() if is_mean else np.zeros((1, 2))
+    blur = np.zeros((len(shifts), pupil.n_pix, pupil.n_pix))
     if is_mean and grid.turbulence_px:
         blur = np.sqrt(_turbulence_strength(config, grid)) * lenslet_turbulence(pupil.n_pix)
     out = {step: np.zeros((2, grid.n_valid, pupil.n_pix, pupil.n_pix)) for step in NEIGHBOURS}
-    for node in range(max(n_nodes, len(wavefronts_m))):
-        images = []
-        for number, (share, shifts) in enumerate(exposures):
-            moved = window_images.moved(shifts[node % n_nodes], blur[node % n_nodes])
-            phasors = dict.fromkeys(NEIGHBOURS, moved)
-            if len(wavefronts_m):
-                # The previous poke is that of another block, which has opposite pokes at opposite nodes, too.
-                at = (node + number * n_nodes) % len(wavefronts_m)
-                around = _neighbour_phasors(grid, pupil, wave * wavefronts_m[at])
-                phasors = {step: moved * phasor for step, phasor in around.items()}
-            images.append((share, phasors))
-        window_images.accumulate(out, images, 1 / max(n_nodes, len(wavefronts_m)))
+    nodes = max(len(shifts), len(wavefronts_m))
+    for node in range(nodes):
+        moved = window_images.moved(shifts[node % len(shifts)], blur[node % len(shifts)])
+        phasors = dict.fromkeys(NEIGHBOURS, moved)
+        if len(wavefronts_m):
+            around = _neighbour_phasors(grid, pupil, wave * wavefronts_m[node % len(wavefronts_m)])
+            phasors = {step: moved * phasor for step, phasor in around.items()}
+        window_images.accumulate(out, phasors, 1 / nodes)
     return {step: block * wave for step, block in out.items()}
-
-
-def _spot_motion(grid: SubApertureGrid, *, has_wavefronts: bool) -> list[tuple[float, NDArray[np.float64]]]:
-    """Parts of an exposure: share of its time, and spot motions ``(n_nodes, 2)`` in pixels.
-
-    The mean of the parts has the measured motion. Their difference is that of two independent pokes, whose
-    motion is what the turbulence leaves; pokes that are given as wavefronts are not spot motions.
-    """
-    mean, q = grid.motion_px * gaussian_lattice(), grid.previous_share
-    if q and has_wavefronts:
-        return [(1 - q, mean), (q, mean)]
-    if not (q and grid.pokes):
-        return [(1.0, mean)]
-    poke_variance = max(0.0, grid.motion_px**2 - grid.turbulence_px**2) / ((1 - q) ** 2 + q**2)
-    correlated = (1 - 2 * q) * poke_variance / grid.motion_px
-    rest = np.sqrt(max(0.0, 2 * poke_variance - correlated**2))
-    half = _uncorrelated_with_nodes(7, 2)
-    difference = correlated * gaussian_lattice() + rest * np.concatenate([half, -half[::-1]])
-    return [(1 - q, mean + q * difference), (q, mean - (1 - q) * difference)]
 
 
 def _neighbour_phasors(
@@ -161,21 +132,12 @@ def lenslet_turbulence(samples: int) -> NDArray[np.float64]:
     tilts = np.linalg.qr(np.stack([np.ones_like(x), x, y], axis=1))[0]
     without_tilt = np.eye(x.size) - tilts @ tilts.T
     power, shapes = np.linalg.eigh(without_tilt @ (-0.5 * 6.88 * distance ** (5 / 3)) @ without_tilt)
-    coefficients = _uncorrelated_with_nodes(5, _N_SHAPES)
+    half = gaussian_lattice()[: _N_NODES // 2]
+    coefficients = np.random.default_rng(5).standard_normal((len(half), _N_SHAPES))
+    coefficients = np.linalg.qr(np.concatenate([half, coefficients], axis=1))[0][:, 2:] * np.sqrt(len(half))
     wavefronts = (coefficients * np.sqrt(power[-_N_SHAPES:])) @ shapes[:, -_N_SHAPES:].T
     first = wavefronts.reshape(-1, samples, samples)
     return np.concatenate([first, first[::-1, ::-1, ::-1]])
-
-
-def _uncorrelated_with_nodes(seed: int, n: int) -> NDArray[np.float64]:
-    """``n`` random numbers of unit rms ``(n_nodes / 2, n)`` for half of the nodes.
-
-    They are uncorrelated with one another and with the nodes.
-    """
-    half = gaussian_lattice()[: _N_NODES // 2]
-    numbers = np.random.default_rng(seed).standard_normal((len(half), n))
-    orthonormal = np.linalg.qr(np.concatenate([half, numbers], axis=1))[0][:, 2:]
-    return np.asarray(orthonormal * np.sqrt(len(half)))
 
 
 def _turbulence_strength(config: SystemConfig, grid: SubApertureGrid) -> float:
@@ -261,22 +223,18 @@ class _WindowImages:
     def accumulate(
         self,
         out: dict[tuple[int, int], NDArray[np.float64]],
-        parts: Sequence[tuple[float, Mapping[tuple[int, int], NDArray[np.complexfloating]]]],
+        phasors: Mapping[tuple[int, int], NDArray[np.complexfloating]],
         share: float,
     ) -> None:
-        """Add ``share`` times the derivatives for an exposure.
-
-        ``parts``: share of each part of the exposure, and the phasors ``(n_valid, p, p)`` of each neighbour.
-        """
-        fields = []
+        """Add ``share`` times the derivatives for the phasors ``(n_valid, p, p)`` of each neighbour."""
+        fields = {}
         image = np.zeros(self._inside.shape, self._real)
-        for weight, phasors in parts:
-            for step in NEIGHBOURS:
-                fy, fx = self._along[step]
-                amplitude = self._blocks[step] * phasors[step]
-                e = np.matmul(np.matmul(fy.transpose(0, 2, 1), amplitude), fx)
-                image += self._real.type(weight) * (e.real**2 + e.imag**2)
-                fields.append((step, weight, amplitude, e))
+        for step in NEIGHBOURS:
+            fy, fx = self._along[step]
+            amplitude = self._blocks[step] * phasors[step]
+            e = np.matmul(np.matmul(fy.transpose(0, 2, 1), amplitude), fx)
+            image += e.real**2 + e.imag**2
+            fields[step] = (amplitude, e)
         counted, above_threshold = self._apply_threshold(image)
         total = np.maximum(counted.sum(axis=(1, 2)), 1e-30)
         x, y = self._columns_at[:, None, :], self._rows_at[:, :, None]
@@ -285,10 +243,10 @@ class _WindowImages:
             moment_arm = (
                 (at - centroid[:, None, None]) * above_threshold * (share / total)[:, None, None]
             ).astype(self._real)
-            for step, weight, amplitude, e in fields:
+            for step, (amplitude, e) in fields.items():
                 fy, fx = self._along[step]
                 back_propagated = np.matmul(np.matmul(fy, moment_arm * e.conj()), fx.transpose(0, 2, 1))
-                out[step][axis] += -2 * weight * np.imag(amplitude * back_propagated)
+                out[step][axis] += -2 * np.imag(amplitude * back_propagated)
 
     def _apply_threshold(
         self, image: NDArray[np.floating]
@@ -594,11 +552,6 @@ class ShackHartmannModel(DesignModel):
             self._variants = [varied] if grid.motion_px or wavefronts else []
         return list(self._variants)
 
-    def with_temporal_response(self, weights: NDArray[np.float64]) -> ShackHartmannModel:
-        """The model for exposures that see two pokes, see :class:`DependsOnResponse`."""
-        grid = self._grid.with_temporal_response(weights)
-        return ShackHartmannModel(self._config, grid, self._wavefronts_m)
-
     def around_pokes(self, registration: Registration, m2c: NDArray[np.float64]) -> ShackHartmannModel | None:
         """The model around random pokes, see :class:`HasPokeResponse`.
 
@@ -620,8 +573,7 @@ class ShackHartmannModel(DesignModel):
         # Opposite nodes of the spot motion have opposite pokes.
         blocks = half.reshape(len(half), _N_POKES, -1)
         pokes = np.concatenate([blocks, -blocks[:, :, ::-1]], axis=2).reshape(len(half), -1)
-        q = grid.previous_share
-        poke_motion = np.hypot(1 - q, q) * float(self.modal_matrix(registration, half).std())
+        poke_motion = float(self.modal_matrix(registration, half).std())
         rest = float(np.sqrt(max(0.0, grid.motion_px**2 - poke_motion**2)))
         paths = np.tensordot(pokes.T * self._opd_per_command_m, surfaces, 1)
         model = ShackHartmannModel(self._config, replace(grid, motion_px=rest, pokes=0.0), tuple(paths))
