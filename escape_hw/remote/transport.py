@@ -125,13 +125,17 @@ class ClientTransport:
                 self._waiting.pop(number, None)
 
     def close(self) -> None:
-        """Close the connection; waiting callers get no reply."""
+        """Close the connection; waiting callers get ``ServerGone``."""
         with self._lock:
             if self._ending:
                 return
             self._ending = True
             self._wake_sender.send(b"")
         self._thread.join(timeout=5)
+        with self._lock:
+            waiting, self._waiting = list(self._waiting.values()), {}
+        for answer in waiting:
+            answer.set_exception(ServerGone("this connection is closed"))
         for socket in (self._requests, self._events, self._wake_receiver, self._wake_sender):
             socket.close()
         self._context.term()
