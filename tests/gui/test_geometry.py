@@ -141,6 +141,26 @@ def test_layouts_of_large_and_small_windows_are_kept_apart(show: Show, tmp_path)
     assert again == pytest.approx(widths, rel=0.1)
 
 
+def test_a_large_window_is_arranged_anew_for_larger_fonts(show: Show) -> None:
+    window = show(Settings(workspace="operate"))
+    window.resize(2560, 1400)
+    for _ in range(5):
+        QApplication.processEvents()
+    assert "trends" in in_front(window)
+    for _ in range(5):
+        window.actions_by_name["larger"].trigger()
+    for _ in range(5):
+        QApplication.processEvents()
+    assert "trends" not in in_front(window)
+    assert (window.width(), window.height()) == (2560, 1400)
+    # What the operator changes from now on is remembered.
+    window.docks["mirror"].hide()
+    window.refresh()
+    window.show_workspace("align")
+    window.show_workspace("operate")
+    assert not window.docks["mirror"].isVisible()
+
+
 @pytest.mark.parametrize("workspace", [one.name for one in WORKSPACES])
 def test_a_layout_is_the_same_after_the_window_had_another_size(workspace: str, show: Show) -> None:
     window = show(Settings(workspace=workspace))
