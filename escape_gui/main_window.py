@@ -342,8 +342,14 @@ class MainWindow(QMainWindow):
     def _change_layout(self) -> None:
         """Arrange the panels anew when the window has become large, or is no longer."""
         if self._fits_large_layout != self._is_large:
+            focused = self.focusWidget()
             self._store_layout()
             self._apply_layout()
+            # Qt passes the focus of a panel that is moved to another widget, which would get the next keys.
+            if focused is not None and not focused.visibleRegion().isEmpty():
+                focused.setFocus()
+            else:
+                self.setFocus()
 
     def resizeEvent(self, event: QResizeEvent) -> None:
         super().resizeEvent(event)

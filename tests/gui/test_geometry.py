@@ -141,6 +141,28 @@ def test_layouts_of_large_and_small_windows_are_kept_apart(show: Show, tmp_path)
     assert again == pytest.approx(widths, rel=0.1)
 
 
+def test_the_focus_stays_when_the_window_becomes_large_or_small(show: Show) -> None:
+    window = show(Settings(workspace="operate"))
+    window.resize(1280, 760)
+    QApplication.processEvents()
+    gain = window.panels["loop"].gain
+    gain.setFocus()
+    for size in ((2560, 1400), (1280, 760)):
+        window.resize(*size)
+        for _ in range(5):
+            QApplication.processEvents()
+        assert window.focusWidget() is gain, size
+    # A field of a panel that the small window does not show.
+    window.resize(2560, 1400)
+    for _ in range(5):
+        QApplication.processEvents()
+    window.panels["log"].search.setFocus()
+    window.resize(1280, 760)
+    for _ in range(5):
+        QApplication.processEvents()
+    assert window.focusWidget() is window
+
+
 def test_a_large_window_is_arranged_anew_for_larger_fonts(show: Show) -> None:
     window = show(Settings(workspace="operate"))
     window.resize(2560, 1400)
