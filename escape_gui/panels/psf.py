@@ -245,7 +245,9 @@ class PsfPanel(Panel):
 
 def format_widths(shape: PsfShape) -> str:
     """Width and radii of encircled energy in pixels, in one short line."""
-    return f"FWHM {_number(shape.fwhm, 2)} px, 50 % {_number(shape.r50, 1)} px, 80 % {_number(shape.r80, 1)} px"
+    return (
+        f"FWHM {_number(shape.fwhm, 2)} px, 50 % {_number(shape.r50, 1)} px, 80 % {_number(shape.r80, 1)} px"
+    )
 
 
 def _number(value: float, decimals: int) -> str:
