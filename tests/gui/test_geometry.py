@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from datetime import UTC, datetime
 
 import fake_results as fake
 import numpy as np
@@ -19,6 +20,8 @@ from escape_gui.settings import Settings
 from escape_gui.window.docks import WORKSPACES, visible_sizes
 from escape_hw.api.registration import TO_STREAM_UNITS
 from escape_hw.io.documents import calibration_document
+from escape_hw.io.night_log import NightEntry
+from escape_hw.io.provenance import format_utc
 from escape_hw.remote.state import (
     Finish,
     FinishedRun,
@@ -236,6 +239,8 @@ def test_panels_and_their_tabs_fit_the_narrowest_window(
     workspace: str, show: Show, source: ScriptedSource
 ) -> None:
     source.entries = (ESCAPE,)
+    now = format_utc(datetime.now(UTC))
+    source.night = [NightEntry(number=0, at_utc=now, kind="sample", values={"strehl": 40.0})]
     window = show(Settings(workspace=workspace))
     window.resize(1024, 700)
     # With a registration, and without a Strehl ratio.
@@ -250,6 +255,14 @@ def test_panels_and_their_tabs_fit_the_narrowest_window(
         window.update_timer.tick(force=True)
         QApplication.processEvents()
     assert wide_panels(window) == set()
+    for dock in window.docks.values():
+        # Panels behind others, too.
+        if dock.isVisible():
+            dock.raise_()
+            for _ in range(3):
+                window.update_timer.tick(force=True)
+                QApplication.processEvents()
+            assert wide_panels(window) == set(), dock.windowTitle()
     form = window.panels["procedure"].form
     assert form._area.horizontalScrollBar().maximum() == 0
     for bar in window.findChildren(QTabBar, options=Qt.FindChildOption.FindDirectChildrenOnly):
