@@ -48,8 +48,6 @@ class LatencyPanel(Panel):
         self._curves = []
         for number, plot in enumerate(self.plots):
             plot.setLogMode(x=False, y=True)
-            # Labels of five digits do not overlap in a narrow panel.
-            plot.getAxis("bottom").setTickDensity(0.6)
             # Room for the upper half of the highest tick label.
             plot.getPlotItem().layout.setContentsMargins(1, 8, 1, 1)
             self._curves.append(plot.curve(number, alone=True, stepMode="center", connect="finite"))
