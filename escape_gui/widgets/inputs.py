@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from PySide6.QtCore import QEvent, QLocale, QObject, Qt, Signal
+from PySide6.QtGui import QValidator
 from PySide6.QtWidgets import QAbstractSpinBox, QDoubleSpinBox, QWidget
 
 #: Range in which a number can be typed, so that a value out of its limits can be reported.
@@ -58,7 +59,7 @@ class NumberBox(QDoubleSpinBox):
             self._typed = False
             self.edited.emit()
 
-    def validate(self, text: str, pos: int) -> object:
+    def validate(self, text: str, pos: int) -> tuple[QValidator.State, str, int]:
         return super().validate(text.replace(",", "."), pos)
 
     def stepBy(self, steps: int) -> None:
