@@ -24,6 +24,7 @@ from PySide6.QtWidgets import (
 
 from escape_gui.client.alarms import LimitMonitor
 from escape_gui.client.availability import tooltip
+from escape_gui.client.connection import CLIENT_NAME
 from escape_gui.client.session import Session
 from escape_gui.panels import PANELS
 from escape_gui.panels.base import Context, Panel
@@ -106,6 +107,8 @@ class MainWindow(QMainWindow):
         self.alarms = LimitMonitor(settings.alarms, self._log_alarm)
         self.alarm_banner = AlarmBanner(self.context, self.actions_by_name["acknowledge"])
         self.alarm_dialog = AlarmDialog(self, settings)
+        # At once: they must also be there in the window after one that was killed.
+        self.alarm_dialog.accepted.connect(self._save_settings)
         self.frozen_banner = FrozenBanner(self.context, self.actions_by_name["freeze"])
         self.control_banner = ControlBanner(self.context, self.actions_by_name["take_control"])
         self.tabs = self._make_tabs()
@@ -144,6 +147,8 @@ class MainWindow(QMainWindow):
         #: Size of the dock area and of the docks by layout, to scale the layout to another size.
         self._dock_sizes: dict[str, tuple[QSize, dict[QDockWidget, QSize]]] = {}
         self._restore()
+        # A window that is large with small fonts may not be with large ones.
+        theme.changed.connect(self._change_layout)
 
     # ------------------------------------------------------------ construction
     def _allow_docks(self) -> None:
@@ -337,8 +342,14 @@ class MainWindow(QMainWindow):
     def _change_layout(self) -> None:
         """Arrange the panels anew when the window has become large, or is no longer."""
         if self._fits_large_layout != self._is_large:
+            focused = self.focusWidget()
             self._store_layout()
             self._apply_layout()
+            # Qt passes the focus of a panel that is moved to another widget, which would get the next keys.
+            if focused is not None and not focused.visibleRegion().isEmpty():
+                focused.setFocus()
+            else:
+                self.setFocus()
 
     def resizeEvent(self, event: QResizeEvent) -> None:
         super().resizeEvent(event)
@@ -454,9 +465,10 @@ class MainWindow(QMainWindow):
         self.context.session.ask("take control", lambda server: server.acquire(take_over=held))
 
     def _log_alarm(self, text: str) -> None:
-        """Add an alarm to the night log; of several windows, the one in control does."""
+        """Add an alarm to the night log, unless another window has control and does."""
         session = self.context.session
-        if session.may_write:
+        lease = session.source.state.lease
+        if session.may_write or lease is None or lease.name != CLIENT_NAME:
             session.ask("log the alarm", lambda server: server.add_note(text, kind="alarm"), quiet=True)
 
     def toggle_recording(self) -> None:
@@ -556,12 +568,15 @@ class MainWindow(QMainWindow):
         settings.geometry = _text(self.saveGeometry())
         settings.theme, settings.font_scale = theme.palette_name, theme.scale
         settings.workspace = self.workspace.name
+        self._save_settings()
+        super().closeEvent(event)
+
+    def _save_settings(self) -> None:
         if self._settings_path is not None:
             try:
-                save_settings(self._settings_path, settings)
+                save_settings(self._settings_path, self._settings)
             except StorageError as error:
                 log.warning("settings not saved: %s", error)
-        super().closeEvent(event)
 
 
 def _bytes(text: str) -> QByteArray:

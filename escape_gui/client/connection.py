@@ -24,6 +24,8 @@ from escape_hw.remote.state import Geometry, LogLine, ProcedureEntry, State
 from escape_hw.supervision import ChildProcess
 
 log = logging.getLogger(__name__)
+#: Name of windows, for the other clients.
+CLIENT_NAME = "escape gui"
 #: Period of the thread for a local and a remote server, interval between connection attempts, and time for
 #: which a stream is fetched after the last request for it; seconds.
 _LOCAL_PERIOD_S, _REMOTE_PERIOD_S, _RETRY_S, _STREAM_EXPIRY_S = 0.2, 0.02, 1.0, 1.0
@@ -162,7 +164,7 @@ class ServerAttachment(QObject):
             return
         if live is not None and now - self._last_heard_s < _RECONNECT_AFTER_S and self._same_server():
             return
-        connection = connect(self.address, name="escape gui")
+        connection = connect(self.address, name=CLIENT_NAME)
         self._live = LiveSource(connection, is_local=self._is_local)
         self._last_heard_s, self._last_failure = now, ""
         self.attached.emit(self._live)

@@ -14,7 +14,7 @@ from PySide6.QtCore import QObject, Qt, Signal
 from escape_gui.client.availability import RequestContext
 from escape_gui.client.history import LoopHistory
 from escape_gui.client.product_library import ProductLibrary
-from escape_hw.errors import EscapeError
+from escape_hw.errors import EscapeError, ServerGone
 from escape_hw.io.night_log import NightEntry
 from escape_hw.io.run_folder import default_runs_folder
 from escape_hw.remote.client import Connection
@@ -22,6 +22,8 @@ from escape_hw.remote.source import DataSource, Sample
 from escape_hw.remote.state import Geometry, LogLine, ProcedureEntry, State
 
 log = logging.getLogger(__name__)
+#: Why a request failed whose connection was replaced meanwhile.
+_REPLACED = "the server did not answer on the previous connection; look at the state, and repeat if necessary"
 T = TypeVar("T")
 
 
@@ -73,13 +75,18 @@ class Session(QObject):
         #: Products listed by the source, loaded for the panels.
         self.library = ProductLibrary()
         self._executors: dict[bool, ThreadPoolExecutor] = {}
+        #: Those of earlier connections, whose last requests may still wait for a reply.
+        self._ended_executors: list[ThreadPoolExecutor] = []
         self._pending = 0
         self._computing: ThreadPoolExecutor | None = None
         self._closed = False
         self._delivered.connect(lambda deliver: deliver(), Qt.ConnectionType.QueuedConnection)
 
     def set_source(self, source: DataSource, control: Connection | None) -> None:
-        """Replace the source; without ``control`` no requests can be sent."""
+        """Replace the source; without ``control`` no requests can be sent.
+
+        Requests without an answer fail; nothing waits for them.
+        """
         self._close_requests()
         self.source, self.control = source, control
         self.changed.emit()
@@ -114,13 +121,18 @@ class Session(QObject):
             return
 
         def deliver(future: Future[T]) -> None:
-            if self.control is not control:
+            if self._closed:
                 return
-            self._set_pending(self._pending - 1)
-            error = future.exception()
-            if error is None:
-                if on_result is not None:
+            error: BaseException | None
+            if self.control is control:
+                self._set_pending(self._pending - 1)
+                error = future.exception()
+                if error is None and on_result is not None:
                     on_result(future.result())
+            else:
+                answered = not future.cancelled() and future.exception() is None
+                error = None if answered else ServerGone(_REPLACED)
+            if error is None:
                 return
             if not isinstance(error, EscapeError):
                 log.error("%s failed unexpectedly", what, exc_info=error)
@@ -195,6 +207,8 @@ class Session(QObject):
     def close(self) -> None:
         self._closed = True
         self._close_requests()
+        for worker in self._ended_executors:
+            worker.shutdown(wait=True)
         if self._computing is not None:
             self._computing.shutdown(wait=True, cancel_futures=True)
             self._computing = None
@@ -202,10 +216,11 @@ class Session(QObject):
         self.source = EmptySource()
 
     def _close_requests(self) -> None:
-        """Stop the threads; answers that still arrive are discarded."""
+        """Stop the threads without waiting for them; answers that still arrive are discarded."""
         self.control = None
         for worker in self._executors.values():
-            worker.shutdown(wait=True, cancel_futures=True)
+            worker.shutdown(wait=False, cancel_futures=True)
+        self._ended_executors += self._executors.values()
         self._executors.clear()
         if self._pending:
             self._set_pending(0)

@@ -11,6 +11,7 @@ from PySide6.QtCore import Signal
 from PySide6.QtGui import QResizeEvent
 from PySide6.QtWidgets import QHBoxLayout, QLabel, QSizePolicy
 
+from escape_gui.client.availability import UNKNOWN_VALUE
 from escape_gui.panels.base import Context, ExportArray, Panel
 from escape_gui.views.images import RadialProfile
 from escape_gui.widgets.controls import SegmentedButton, caption, column, flat_button, row
@@ -244,16 +245,25 @@ class PsfPanel(Panel):
 
 def format_widths(shape: PsfShape) -> str:
     """Width and radii of encircled energy in pixels, in one short line."""
-    return f"FWHM {shape.fwhm:.2f} px, 50 % {shape.r50:.1f} px, 80 % {shape.r80:.1f} px"
+    return (
+        f"FWHM {_number(shape.fwhm, 2)} px, 50 % {_number(shape.r50, 1)} px, 80 % {_number(shape.r80, 1)} px"
+    )
+
+
+def _number(value: float, decimals: int) -> str:
+    """A number; that of a radius beyond the image is unknown."""
+    return f"{value:.{decimals}f}" if np.isfinite(value) else UNKNOWN_VALUE
 
 
 def format_shape(shape: PsfShape, psf_px: float) -> str:
     """Width and encircled energy in pixels and, where lambda/D is known, in lambda/D."""
 
     def length(pixels: float) -> str:
-        return f"{pixels:.2f} px" + (f" ({pixels / psf_px:.2f} λ/D)" if psf_px else "")
+        known = psf_px and np.isfinite(pixels)
+        return f"{_number(pixels, 2)} px" + (f" ({pixels / psf_px:.2f} λ/D)" if known else "")
 
-    elongation = f"{shape.major:.2f} × {shape.minor:.2f} at {shape.angle_deg:.0f}°"
+    axes = f"{_number(shape.major, 2)} × {_number(shape.minor, 2)}"
+    elongation = f"{axes} at {_number(shape.angle_deg, 0)}°"
     return (
         f"FWHM {length(shape.fwhm)}, {elongation}   peak {shape.peak:.0f}\n"
         f"50 % within {length(shape.r50)}   80 % within {length(shape.r80)}"

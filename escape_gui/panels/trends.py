@@ -7,11 +7,13 @@ from collections.abc import Callable
 from datetime import UTC, datetime
 from typing import ClassVar
 
+from PySide6.QtGui import QResizeEvent
+
 from escape_gui.client.availability import UNKNOWN_VALUE
 from escape_gui.client.session import runs_folder
 from escape_gui.panels.base import Context, ExportArray, Panel
 from escape_gui.views.trends import TRENDS, TrendHistory, night_medians, read_summaries
-from escape_gui.widgets.controls import Readout, SegmentedButton, caption, row
+from escape_gui.widgets.controls import Readout, SegmentedButton, caption, fit_height, row
 from escape_gui.widgets.trend_plot import TrendsPlot
 from escape_hw.io.night_log import NightEntry, night_of
 from escape_hw.remote.source import DataSource
@@ -50,10 +52,13 @@ class TrendsPanel(Panel):
         )
         self.span.choose("12 h")
         self.span.chosen.connect(self._on_span_chosen)
+        #: What is not measured, or what the nights show.
         self.missing = caption()
         self.plot = TrendsPlot(context.theme)
         self.body.addLayout(row(*self.readouts.values(), None, spacing=24))
-        self.body.addLayout(row(self.span, (self.missing, 1)))
+        self.missing.setWordWrap(True)
+        self.body.addLayout(row(self.span, None))
+        self.body.addWidget(self.missing)
         self.body.addWidget(self.plot, 1)
         self._number = -1
 
@@ -81,7 +86,16 @@ class TrendsPanel(Panel):
         }
         self.plot.show_hours(curves, self.history.marks, now - span_s, now)
         empty = [trend.names[0] for trend in TRENDS if not any(curves[name].size for name in trend.names)]
-        self.missing.setText("" if not empty else "not measured: " + ", ".join(_WORDS[one] for one in empty))
+        self._show_missing("" if not empty else "not measured: " + ", ".join(_WORDS[one] for one in empty))
+
+    def _show_missing(self, text: str) -> None:
+        if text != self.missing.text():
+            self.missing.setText(text)
+            fit_height(self.missing)
+
+    def resizeEvent(self, event: QResizeEvent) -> None:
+        super().resizeEvent(event)
+        fit_height(self.missing)
 
     def _on_span_chosen(self, name: str) -> None:
         self.dirty = bool(SPANS_S[name])
@@ -90,15 +104,15 @@ class TrendsPanel(Panel):
         session = self.context.session
         night, system, runs = night_of(datetime.now(UTC)), session.source.state.system, runs_folder(session)
         tonight = _of_night(session.source.night_after(-1), night)
-        self.missing.setText("Reading the nights…")
+        self._show_missing("Reading the nights…")
         session.compute(
-            lambda: read_summaries(runs, system, tonight, night), self._show_nights, self.missing.setText
+            lambda: read_summaries(runs, system, tonight, night), self._show_nights, self._show_missing
         )
 
     def _show_nights(self, nights: dict[str, dict[str, tuple[float, float, float]]]) -> None:
         if SPANS_S[self.span.selected]:
             return
-        self.missing.setText(f"{len(nights)} nights: median and central 68 %")
+        self._show_missing(f"{len(nights)} nights: median and central 68 %")
         points = {name: night_medians(nights, trend, name) for trend in TRENDS for name in trend.names}
         self.plot.show_nights(points, sorted(nights))
 

@@ -56,6 +56,8 @@ def read_runs(runs: Path) -> Iterator[RunSummary]:
             yield _summarise(folder)
         except (ProductError, OSError) as error:
             log.info("run not listed: %s", error)
+        except (TypeError, ValueError, OverflowError) as error:
+            log.info("run not listed: %s: its document is damaged (%s)", folder, error)
 
 
 def _summarise(folder: Path) -> RunSummary:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from PySide6.QtCore import QEvent, QObject, Qt, Signal
+from PySide6.QtCore import QEvent, QLocale, QObject, Qt, Signal
+from PySide6.QtGui import QValidator
 from PySide6.QtWidgets import QAbstractSpinBox, QDoubleSpinBox, QWidget
 
 #: Range in which a number can be typed, so that a value out of its limits can be reported.
@@ -24,7 +25,11 @@ def ignore_wheel_without_focus(widget: QWidget) -> None:
 
 
 class NumberBox(QDoubleSpinBox):
-    """A number with limits. Other numbers can be typed, to be reported; arrows and wheel stay within them."""
+    """A number with limits. Other numbers can be typed, to be reported; arrows and wheel stay within them.
+
+    Numbers have a decimal point in every language of the system, as everywhere in the window, and no group
+    separators; a typed comma becomes a point.
+    """
 
     #: The operator changed the value: emitted from the first key on, but not by :meth:`setValue`.
     edited = Signal()
@@ -35,6 +40,11 @@ class NumberBox(QDoubleSpinBox):
         self.setRange(-_TYPED_RANGE, _TYPED_RANGE)
         self.setSingleStep(step)
         self.setDecimals(decimals)
+        locale = QLocale.c()
+        locale.setNumberOptions(
+            QLocale.NumberOption.OmitGroupSeparator | QLocale.NumberOption.RejectGroupSeparator
+        )
+        self.setLocale(locale)
         self._typed = False
         self.lineEdit().textEdited.connect(self._on_typed)
         # Emitted after the previous signal, when Qt has updated the value.
@@ -48,6 +58,9 @@ class NumberBox(QDoubleSpinBox):
         if self._typed:
             self._typed = False
             self.edited.emit()
+
+    def validate(self, text: str, pos: int) -> tuple[QValidator.State, str, int]:
+        return super().validate(text.replace(",", "."), pos)
 
     def stepBy(self, steps: int) -> None:
         self.interpretText()

@@ -44,7 +44,7 @@ class Plot(pg.PlotWidget):  # type: ignore[misc]
     """
 
     def __init__(self, theme: Theme, name: str, x: str, y: str) -> None:
-        super().__init__()
+        super().__init__(axisItems={"bottom": SparseAxis("bottom")})
         self._theme, self._labels = theme, {"bottom": x, "left": y}
         self._curves: list[tuple[Any, int, bool]] = []
         self.setAccessibleName(name)
@@ -159,15 +159,20 @@ class StripChart(Plot):
 
 
 class SparseAxis(pg.AxisItem):  # type: ignore[misc]
-    """A left axis without more numbers than there is room for."""
+    """An axis without more numbers than there is room for."""
 
     def tickValues(self, low: float, high: float, size: float) -> list[tuple[float, list[float]]]:
         levels: list[tuple[float, list[float]]] = super().tickValues(low, high, size)
         if not levels:
             return levels
         (spacing, values), *others = levels
-        line = QFontMetricsF(self.style["tickFont"] or self.font()).height()
-        step = max(1, math.ceil(len(values) * line / max(size, line)))
+        metrics = QFontMetricsF(self.style["tickFont"] or self.font())
+        if self.orientation in ("left", "right"):
+            room = metrics.height()
+        else:
+            texts = self.tickStrings(values, self.autoSIPrefixScale * self.scale, spacing)
+            room = max(map(metrics.horizontalAdvance, (*texts, ""))) + metrics.averageCharWidth()
+        step = max(1, math.ceil(len(values) * room / max(size, room)))
         return [(spacing, list(values[::step])), *(others if step == 1 else ())]
 
 

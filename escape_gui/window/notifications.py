@@ -118,7 +118,8 @@ class StateNotifier:
         self._bar.close_messages(_LOST)
         if state.fault is None:
             self._bar.close_messages(_FAULT)
-        if before is None or not was_connected:
+        # A front end that was restarted may have been away for less than what counts as disconnected.
+        if before is None or not was_connected or state.notes != before.notes:
             for notice in state.notes:
                 self._bar.show_message(Level.WARNING, "Startup notice", notice)
         if before is None:

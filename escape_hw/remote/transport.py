@@ -16,7 +16,7 @@ from typing import Any
 
 import zmq
 
-from escape_hw.errors import ServerGone
+from escape_hw.errors import ClientUnknown, ServerGone
 from escape_hw.remote.address import Endpoint
 from escape_hw.remote.requests import error_from_document
 from escape_hw.supervision import BackgroundThread
@@ -27,8 +27,10 @@ log = logging.getLogger(__name__)
 TIMEOUT_S, SLOW_TIMEOUT_S = 3.0, 30.0
 #: Interval of heartbeats, seconds.
 _HEARTBEAT_S = 0.5
-#: Identifier of heartbeats, whose reply no caller waits for.
-_HEARTBEAT_ID = b"0"
+#: Identifier of heartbeats, whose reply no caller waits for; the number of the last request follows.
+_HEARTBEAT = b"h"
+#: Why a request failed that was sent to a server that has ended meanwhile.
+_LOST_TEXT = "the server ended before it replied; look at the state, and repeat the request if necessary"
 #: Largest reply that is accepted, bytes.
 _LARGEST = 256 << 20
 
@@ -76,6 +78,8 @@ class ClientTransport:
         self._outbox: deque[tuple[bytes, bytes]] = deque()
         self._waiting: dict[bytes, Future[Reply]] = {}
         self._numbers = itertools.count(1)
+        #: Number of the last request that was sent.
+        self._last_sent = b"0"
         self._ending = self._heartbeat_refused = False
         #: Time of the last message of the server, monotonic seconds.
         self.last_message_s = 0.0
@@ -125,13 +129,17 @@ class ClientTransport:
                 self._waiting.pop(number, None)
 
     def close(self) -> None:
-        """Close the connection; waiting callers get no reply."""
+        """Close the connection; waiting callers get ``ServerGone``."""
         with self._lock:
             if self._ending:
                 return
             self._ending = True
             self._wake_sender.send(b"")
         self._thread.join(timeout=5)
+        with self._lock:
+            waiting, self._waiting = list(self._waiting.values()), {}
+        for answer in waiting:
+            answer.set_exception(ServerGone("this connection is closed"))
         for socket in (self._requests, self._events, self._wake_receiver, self._wake_sender):
             socket.close()
         self._context.term()
@@ -155,7 +163,7 @@ class ClientTransport:
                 refused, self._heartbeat_refused = self._heartbeat_refused, False
                 if (message := self._heartbeat(refused)) is not None:
                     last_heartbeat_s = time.monotonic()
-                    self._send(_HEARTBEAT_ID, json.dumps(message).encode())
+                    self._send(_HEARTBEAT + self._last_sent, json.dumps(message).encode())
 
     def _send_all(self) -> None:
         while True:
@@ -164,6 +172,7 @@ class ClientTransport:
                     return
                 number, text = self._outbox.popleft()
             self._send(number, text)
+            self._last_sent = number
 
     def _send(self, number: bytes, text: bytes) -> None:
         try:
@@ -176,7 +185,7 @@ class ClientTransport:
         self.last_message_s = time.monotonic()
         with self._lock:
             answer = self._waiting.pop(parts[0], None)
-        if answer is None and parts[0] != _HEARTBEAT_ID:
+        if answer is None and not parts[0].startswith(_HEARTBEAT):
             return
         try:
             reply = json.loads(parts[1])
@@ -184,6 +193,8 @@ class ClientTransport:
                 self._heartbeat_refused = not reply["ok"]
                 if reply["ok"]:
                     self._on_heartbeat_answer(reply["answer"])
+                elif isinstance(error_from_document(reply["error"]), ClientUnknown):
+                    self._fail_requests(int(parts[0].removeprefix(_HEARTBEAT)))
                 return
             if reply["ok"]:
                 data = parts[2] if len(parts) > 2 else b""
@@ -196,6 +207,17 @@ class ClientTransport:
                 log.warning("%s", invalid_reply)
             else:
                 answer.set_exception(invalid_reply)
+
+    def _fail_requests(self, last: int) -> None:
+        """End the wait for requests that a server took with it when it ended: those before a heartbeat.
+
+        The server that refused the heartbeat does not know this client. It has replied to what reached it
+        before the heartbeat; ``last`` is the number of the last of them.
+        """
+        with self._lock:
+            lost = [self._waiting.pop(number) for number in list(self._waiting) if int(number) <= last]
+        for answer in lost:
+            answer.set_exception(ServerGone(_LOST_TEXT))
 
     def _receive_events(self) -> None:
         while True:

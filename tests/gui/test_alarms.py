@@ -8,11 +8,13 @@ import pytest
 from PySide6.QtCore import Qt
 from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QApplication, QDialogButtonBox
-from scripted import ScriptedSource
+from pytestqt.qtbot import QtBot
+from scripted import LEASE, ScriptedControl, ScriptedSource
 
 from escape_gui.main_window import MainWindow
 from escape_gui.panels.log import LogPanel
-from escape_hw.remote.state import ActiveRun, FrameCounters, Illumination
+from escape_gui.settings import load_settings
+from escape_hw.remote.state import ActiveRun, FrameCounters, Illumination, Lease
 
 
 @pytest.fixture
@@ -113,3 +115,32 @@ def test_a_limit_out_of_range_is_reported(window: MainWindow) -> None:
     assert "Strehl ratio: 140 is out of range: 0 to 100" in window.alarm_dialog.message.text()
     assert window._settings.alarms == {}
     window.alarm_dialog.reject()
+
+
+def test_the_limits_outlive_a_window_that_is_killed(window: MainWindow) -> None:
+    set_limit(window, "residual", "30", muted=True)
+    assert window._settings_path is not None
+    settings, _ = load_settings(window._settings_path)
+    assert settings.alarms == {"residual": 30.0}
+    assert settings.alarms_muted
+
+
+@pytest.mark.parametrize(
+    ("lease", "logged"),
+    [
+        (LEASE, True),
+        (None, True),
+        (LEASE.model_copy(update={"client": "f" * 16, "name": "notebook"}), True),
+        (LEASE.model_copy(update={"client": "f" * 16, "name": "escape gui"}), False),
+    ],
+)
+def test_an_alarm_is_logged_unless_another_window_does(
+    lease: Lease | None, logged: bool, window: MainWindow, source: ScriptedSource,
+    control: ScriptedControl, qtbot: QtBot,
+) -> None:  # fmt: skip
+    source.change(lease=lease)
+    set_limit(window, "residual", "30", muted=True)
+    pass_states(window, source)
+    QTest.keyClick(window, Qt.Key.Key_K, Qt.KeyboardModifier.ControlModifier)
+    qtbot.waitUntil(lambda: window.context.session._pending == 0)
+    assert control.verbs == ["add_note", "add_note"] * logged

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from datetime import UTC, datetime
 
 import fake_results as fake
 import numpy as np
@@ -19,6 +20,8 @@ from escape_gui.settings import Settings
 from escape_gui.window.docks import WORKSPACES, visible_sizes
 from escape_hw.api.registration import TO_STREAM_UNITS
 from escape_hw.io.documents import calibration_document
+from escape_hw.io.night_log import NightEntry
+from escape_hw.io.provenance import format_utc
 from escape_hw.remote.state import (
     Finish,
     FinishedRun,
@@ -141,6 +144,48 @@ def test_layouts_of_large_and_small_windows_are_kept_apart(show: Show, tmp_path)
     assert again == pytest.approx(widths, rel=0.1)
 
 
+def test_the_focus_stays_when_the_window_becomes_large_or_small(show: Show) -> None:
+    window = show(Settings(workspace="operate"))
+    window.resize(1280, 760)
+    QApplication.processEvents()
+    gain = window.panels["loop"].gain
+    gain.setFocus()
+    for size in ((2560, 1400), (1280, 760)):
+        window.resize(*size)
+        for _ in range(5):
+            QApplication.processEvents()
+        assert window.focusWidget() is gain, size
+    # A field of a panel that the small window does not show.
+    window.resize(2560, 1400)
+    for _ in range(5):
+        QApplication.processEvents()
+    window.panels["log"].search.setFocus()
+    window.resize(1280, 760)
+    for _ in range(5):
+        QApplication.processEvents()
+    assert window.focusWidget() is window
+
+
+def test_a_large_window_is_arranged_anew_for_larger_fonts(show: Show) -> None:
+    window = show(Settings(workspace="operate"))
+    window.resize(2560, 1400)
+    for _ in range(5):
+        QApplication.processEvents()
+    assert "trends" in in_front(window)
+    for _ in range(5):
+        window.actions_by_name["larger"].trigger()
+    for _ in range(5):
+        QApplication.processEvents()
+    assert "trends" not in in_front(window)
+    assert (window.width(), window.height()) == (2560, 1400)
+    # What the operator changes from now on is remembered.
+    window.docks["mirror"].hide()
+    window.refresh()
+    window.show_workspace("align")
+    window.show_workspace("operate")
+    assert not window.docks["mirror"].isVisible()
+
+
 @pytest.mark.parametrize("workspace", [one.name for one in WORKSPACES])
 def test_a_layout_is_the_same_after_the_window_had_another_size(workspace: str, show: Show) -> None:
     window = show(Settings(workspace=workspace))
@@ -194,6 +239,8 @@ def test_panels_and_their_tabs_fit_the_narrowest_window(
     workspace: str, show: Show, source: ScriptedSource
 ) -> None:
     source.entries = (ESCAPE,)
+    now = format_utc(datetime.now(UTC))
+    source.night = [NightEntry(number=0, at_utc=now, kind="sample", values={"strehl": 40.0})]
     window = show(Settings(workspace=workspace))
     window.resize(1024, 700)
     # With a registration, and without a Strehl ratio.
@@ -208,6 +255,14 @@ def test_panels_and_their_tabs_fit_the_narrowest_window(
         window.update_timer.tick(force=True)
         QApplication.processEvents()
     assert wide_panels(window) == set()
+    for dock in window.docks.values():
+        # Panels behind others, too.
+        if dock.isVisible():
+            dock.raise_()
+            for _ in range(3):
+                window.update_timer.tick(force=True)
+                QApplication.processEvents()
+            assert wide_panels(window) == set(), dock.windowTitle()
     form = window.panels["procedure"].form
     assert form._area.horizontalScrollBar().maximum() == 0
     for bar in window.findChildren(QTabBar, options=Qt.FindChildOption.FindDirectChildrenOnly):

@@ -10,7 +10,8 @@ from typing import TypeVar
 import numpy as np
 import pytest
 from PySide6.QtCore import Qt
-from PySide6.QtGui import QGuiApplication
+from PySide6.QtGui import QFontMetricsF, QGuiApplication
+from PySide6.QtWidgets import QApplication
 from pytestqt.qtbot import QtBot
 from scripted import DEVICES, ScriptedSource, running, secondary
 
@@ -26,6 +27,8 @@ from escape_gui.panels.log import LogPanel
 from escape_gui.panels.mirror import MirrorPanel
 from escape_gui.panels.performance import PerformancePanel
 from escape_gui.panels.psf import PsfPanel
+from escape_gui.theme import Theme
+from escape_gui.widgets.plots import Plot
 from escape_hw.errors import StorageError
 from escape_hw.remote.state import (
     DeviceHealth,
@@ -338,3 +341,17 @@ def test_the_scale_of_a_mirror_without_commands_is_flat(window: MainWindow, sour
     source.push("commands", np.zeros_like(source.latest("commands").data))
     window.update_timer.tick(force=True)
     assert panel.scale.text() == "flat"
+
+
+def test_numbers_below_a_narrow_plot_do_not_overlap(qapp: QApplication) -> None:
+    plot = Plot(Theme(), "Latencies", "latency [µs]", "frames")
+    axis = plot.getAxis("bottom")
+    metrics = QFontMetricsF(axis.style["tickFont"])
+    for width in (90, 130, 400):
+        for high in (500, 9000, 24_000, 120_000):
+            spacing, values = axis.tickValues(0, high, width)[0]
+            texts = axis.tickStrings(values, 1.0, spacing)
+            assert texts
+            assert sum(map(metrics.horizontalAdvance, texts)) < width
+    plot.close()
+    plot.deleteLater()

@@ -25,7 +25,7 @@ from escape_gui.views.images import MAP_GAP, ActuatorImage, RadialProfile, mask_
 from escape_gui.views.loop_form import LoopSettingsEdit
 from escape_gui.widgets.images import SEQUENTIAL_MAPS, ImageViewer, outline_points
 from escape_hw.cli.app import run
-from escape_hw.errors import ConfigError
+from escape_hw.errors import ConfigError, ServerGone
 from escape_hw.remote.state import Geometry, LoopState
 
 SURFACES = ("window", "panel", "field")
@@ -177,6 +177,33 @@ def test_answers_after_closing_are_discarded(control: ScriptedControl, qtbot: Qt
     qtbot.wait(50)
     assert heard == []
     assert control.asked == []
+
+
+def test_a_new_connection_does_not_wait_for_answers_of_the_one_before(
+    requests: Session, control: ScriptedControl, qtbot: QtBot
+) -> None:
+    go_on, ended, heard = threading.Event(), threading.Event(), []
+
+    def call(server: object) -> None:
+        go_on.wait(20)
+        ended.set()
+        raise ServerGone("no reply to 'flatten' within 30 s")
+
+    requests.ask("flatten the mirror", call, heard.append, heard.append, urgent=True)
+    requests.ask("plan", lambda server: go_on.wait(20), heard.append, heard.append)
+    assert requests._pending == 2
+    again = ScriptedControl()
+    requests.set_source(EmptySource(), again)
+    assert not ended.is_set()
+    assert requests._pending == 0
+    requests.ask("flatten the mirror", lambda server: server.flatten(), urgent=True)
+    qtbot.waitUntil(lambda: again.verbs == ["flatten"])
+    # The operator is told of the request without an answer; a late answer is discarded.
+    with qtbot.waitSignal(requests.failed) as told:
+        go_on.set()
+    assert told.args[0] == "flatten the mirror"
+    assert "repeat if necessary" in told.args[1]
+    assert heard == [told.args[1]]
 
 
 # ---------------------------------------------------------------- pictures

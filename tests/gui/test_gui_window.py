@@ -140,6 +140,16 @@ def test_the_end_of_a_run_is_notified(small_window: MainWindow, source: Scripted
     assert small_window.notifications.notifications == []
 
 
+def test_a_restarted_server_is_notified_also_without_a_lost_connection(
+    small_window: MainWindow, source: ScriptedSource
+) -> None:
+    source.change(notes=("the previous server (process 7) did not end cleanly",))
+    for _ in range(2):
+        small_window.refresh()
+    notes = [(one.title, one.text) for one in small_window.notifications.notifications]
+    assert notes == [("Startup notice", "the previous server (process 7) did not end cleanly")]
+
+
 def test_the_form_and_its_result_have_room(make_window: MakeWindow, source: ScriptedSource) -> None:
     """Nine arguments and five lines of result at 1280 x 800, and no unit at its field's edge."""
     parameters = (

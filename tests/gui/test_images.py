@@ -15,9 +15,10 @@ from scripted import ScriptedSource
 
 from escape_gui.main_window import MainWindow
 from escape_gui.panels.camera import CameraPanel
-from escape_gui.panels.psf import PsfPanel
+from escape_gui.panels.psf import PsfPanel, format_shape, format_widths
 from escape_gui.views.images import FrameAverage
 from escape_gui.widgets.images import ImageToolbar
+from escape_hw.pipeline.psf.shape import PsfShape
 
 MakeWindow = Callable[..., MainWindow]
 
@@ -135,3 +136,9 @@ def test_an_image_without_light_has_no_width(make_window: MakeWindow, source: Sc
     assert isinstance(psf, PsfPanel)
     assert psf.shape is None
     assert "no light" in psf.shape_text.text()
+
+
+def test_a_radius_beyond_the_image_is_unknown() -> None:
+    shape = PsfShape(5.0, 5.0, 100.0, 900.0, 2.3, 2.5, 2.1, 0.0, 4.0, float("nan"))
+    assert format_widths(shape) == "FWHM 2.30 px, 50 % 4.0 px, 80 % – px"
+    assert format_shape(shape, 2.0).endswith("50 % within 4.00 px (2.00 λ/D)   80 % within – px")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import pytest
-from PySide6.QtCore import QPoint, QPointF, Qt
+from PySide6.QtCore import QLocale, QPoint, QPointF, Qt
 from PySide6.QtGui import QWheelEvent
 from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QApplication, QStyle, QStyleOptionSpinBox, QWidget
@@ -212,3 +212,25 @@ def test_only_checked_values_close_the_loop(
     qtbot.waitUntil(lambda: control.verbs == ["close_loop"], timeout=20 * HOLD_MS)
     qtbot.keyRelease(loop.close_button, Qt.Key.Key_Return)
     assert control.asked[0][1] == {"args": ("escape", 0.3, 0.02, 3)}
+
+
+@pytest.mark.parametrize("language", ["en_US", "de_DE", "ar_EG"])
+@pytest.mark.parametrize("typed", ["0.05", "0,05"])
+def test_numbers_have_a_decimal_point_in_every_language(
+    language: str, typed: str, make_window: Callable[..., MainWindow], source: ScriptedSource
+) -> None:
+    source.change(loop=OPEN)
+    before = QLocale()
+    QLocale.setDefault(QLocale(language))
+    try:
+        window = make_window((LoopPanel,))
+        loop = window.panels["loop"]
+        assert isinstance(loop, LoopPanel)
+        assert loop.gain.text() == "0.4000"
+        Typist(window, source).type(loop.leak, typed)
+        assert loop.leak.text() == "0.05"
+        assert loop.edit.leak == 0.05
+        QTest.keyClick(loop.leak, Qt.Key.Key_Return)
+        assert loop.message.text() == "Checked: leak 0.02 → 0.05"
+    finally:
+        QLocale.setDefault(before)

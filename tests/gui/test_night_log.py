@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from escape_gui.panels.night import NightPanel
 from escape_gui.panels.trends import TrendsPanel
 from escape_gui.settings import Settings
 from escape_gui.views.trends import TRENDS, TrendHistory, hour_ticks, night_medians
+from escape_hw.errors import ServerGone
 from escape_hw.io.night_log import NightEntry
 from escape_hw.io.provenance import format_utc
 
@@ -65,6 +67,29 @@ def test_a_refused_note_stays_in_the_field(panel: NightPanel, control: ScriptedC
     wait_for(lambda: panel.note.isEnabled() and panel.message.text())
     assert panel.note.text() == "clouds"
     assert "the server is gone" in panel.message.text()
+
+
+def test_a_note_without_an_answer_can_be_sent_again_after_a_reconnection(
+    panel: NightPanel, source: ScriptedSource, control: ScriptedControl
+):
+    go_on = threading.Event()
+
+    def add_note(text: str) -> None:
+        go_on.wait(20)
+        raise ServerGone("this connection is closed")
+
+    control.add_note = add_note
+    QTest.keyClicks(panel.note, "clouds")
+    QTest.keyClick(panel.note, Qt.Key.Key_Return)
+    assert not panel.note.isEnabled()
+    panel.context.session.set_source(source, again := ScriptedControl())
+    go_on.set()
+    wait_for(lambda: panel.note.isEnabled())
+    assert panel.note.text() == "clouds"
+    assert "The note is not in the log" in panel.message.text()
+    QTest.keyClick(panel.note, Qt.Key.Key_Return)
+    wait_for(lambda: not panel.note.text())
+    assert again.asked == [("add_note", {"args": ("clouds",)})]
 
 
 def test_events_are_shown_once_and_filtered(panel: NightPanel, source: ScriptedSource):

@@ -48,6 +48,8 @@ def runs(tmp_path: Path) -> Path:
         snr=None,
     )
     (runs / "2026-11-22" / "030405_razor-shwfs_broken-9").mkdir()
+    for number, frames in enumerate(("many", [1], float("nan"), float("inf")), 10):
+        make_run(runs, "2026-11-22", f"030405_razor-shwfs_odd-{number}", frames=frames)
     return runs
 
 

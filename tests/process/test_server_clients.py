@@ -121,3 +121,20 @@ def test_safety_requests_work_beyond_the_limit_and_silent_clients_lose_their_pla
             assert bench.state.mirror.peak == 0
             # The silent ones are removed.
             assert wait_for(lambda: has_place(late), "a free place") < 30
+
+
+def test_a_client_of_another_computer_gets_the_log_of_a_restarted_server(
+    system: Path, tmp_path: Path
+) -> None:
+    words, address = (system, "--port", PORT + 1), f"tcp://127.0.0.1:{PORT + 1}"
+    with serving(*words, folder=tmp_path) as served, served.connect() as local:
+        until_idle(local)
+        with connect(address) as remote:
+            until_idle(remote)
+            first = remote.state.server_pid
+            served.stop()
+            before = remote.log_after(-1)[-1].number
+            served.start()
+            wait_for(lambda: remote.state.server_pid != first, "the other server")
+            until_idle(remote)
+            wait_for(lambda: any("devices open" in line.text for line in remote.log_after(before)), "its log")

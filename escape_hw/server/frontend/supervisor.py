@@ -34,8 +34,6 @@ _FRONT_END = "escape_hw.server.frontend.main"
 #: Seconds that a front end may take to end: its engine ends before, and its fail-safe process after that.
 _STOP_TIMEOUT_S = 2 * STOP_TIMEOUT_S + 10.0
 _POLL_S = 0.05
-#: Log lines and states of a restarted front end have larger numbers than those before, which clients have.
-_NUMBERS_OF_A_FRONT_END = 10**9
 #: ``prctl`` option: orphaned descendants become children of this process.
 _PR_SET_CHILD_SUBREAPER = 36
 
@@ -71,7 +69,7 @@ class FrontEndSupervisor:
         self.listing = ServerListing(name, pid, process_start(pid) or 0, local.requests, local.events, tcp)
         self._setup = FrontEndSetup(
             config_text=config.to_toml(), local=local, host=host, port=port, runs=runs,
-            read_folders=read_folders, server_pid=pid,
+            read_folders=read_folders, server_pid=pid, first_number=_first_number(),
         )  # fmt: skip
         self._process: ChildProcess | None = None
 
@@ -122,8 +120,7 @@ class FrontEndSupervisor:
         """Wait for the end of the processes of a front end that died."""
         log.error("the front end (process %d) died with code %s", process.pid, code)
         self._process = None
-        first_number = self._setup.first_number + _NUMBERS_OF_A_FRONT_END
-        self._setup = self._setup.model_copy(update={"first_number": first_number})
+        self._setup = self._setup.model_copy(update={"first_number": _first_number()})
         _reap_orphans()
 
     def _restart(self, backoff: Backoff) -> None:
@@ -157,6 +154,14 @@ class FrontEndSupervisor:
             if not process.wait_or_kill(_STOP_TIMEOUT_S):
                 log.error("the front end did not end within %g s and was killed", _STOP_TIMEOUT_S)
             _reap_orphans()
+
+
+def _first_number() -> int:
+    """Number of the first log line and state of a front end, microseconds since 1970.
+
+    Clients keep the numbers of what they have: those of a later front end or server must be larger.
+    """
+    return int(1e6 * time.time())
 
 
 def _request_stop(process: ChildProcess) -> None:
