@@ -9,8 +9,8 @@ from escape_hw.remote.state import State
 
 
 def is_busy(state: State) -> bool:
-    """Whether a procedure runs or the loop is closed."""
-    return state.active_run is not None or state.loop.closed
+    """Whether a procedure runs, the loop is closed, or telemetry is recorded."""
+    return state.active_run is not None or state.loop.closed or state.recording.recording
 
 
 def describe_activity(state: State) -> str:
@@ -19,7 +19,9 @@ def describe_activity(state: State) -> str:
         return "A poke is held; it returns to flat by itself."
     if state.active_run is not None:
         return f"'{state.active_run.name}' (run {state.active_run.id}) is running."
-    return "The loop is closed." if state.loop.closed else "Nothing is running."
+    if state.loop.closed:
+        return "The loop is closed."
+    return "Telemetry is being recorded." if state.recording.recording else "Nothing is running."
 
 
 def describe_future(state: State, *, mine: bool) -> str:
@@ -33,6 +35,8 @@ def describe_future(state: State, *, mine: bool) -> str:
         what = "The procedure goes on to its end, its result is saved"
     elif state.loop.closed:
         what = "The loop stays closed"
+    elif state.recording.recording:
+        what = "The recording goes on"
     else:
         what = "The mirror stays flat"
     return (

@@ -13,7 +13,7 @@ from scripted import LEASE, ScriptedControl, ScriptedSource
 from escape_gui.main_window import MainWindow
 from escape_gui.panels.log import LogPanel
 from escape_gui.window.closing import CloseQuestion
-from escape_hw.remote.state import ActiveRun, Lease, LoopState, Phase
+from escape_hw.remote.state import ActiveRun, Lease, LoopState, Phase, RecordingState
 
 RUN = ActiveRun(id=3, name="docrime", arguments={}, completed=400, total=5000)
 OTHER = Lease(client="f" * 16, name="ben", host="control", pid=9, since_utc="2026-11-21T20:00:00")
@@ -39,6 +39,16 @@ def press_quit(window: MainWindow) -> Callable[[], CloseQuestion]:
 
 def make_idle(source: ScriptedSource) -> None:
     source.change(phase=Phase.IDLE, loop=LoopState())
+
+
+def test_closing_while_telemetry_is_recorded_asks(
+    source: ScriptedSource, press_quit: Callable[[], CloseQuestion]
+) -> None:
+    make_idle(source)
+    source.change(recording=RecordingState(recording=True, path="/data/telemetry.h5", written=4000))
+    question = press_quit()
+    assert question.text() == "Telemetry is being recorded."
+    assert "The recording goes on" in question.informativeText()
 
 
 @pytest.mark.parametrize("started", [False, True], ids=["attached", "started"])

@@ -90,7 +90,8 @@ class ProcedureRegistry:
             if one.kind == "matrix" and value is not None:
                 arguments[one.name] = product_store.matrix_path(value)
             elif one.kind == "matrix" and one.required:
-                raise ConfigError(f"{one.name} is missing; name a matrix that the server holds")
+                title = one.label or "matrix"
+                raise ConfigError(f"{title} ({one.name}) is missing; name one that the server holds")
             elif one.kind == "run" and value is not None:
                 arguments[one.name] = product_store.readable_path(value)
         resume = arguments.get("resume")
