@@ -126,7 +126,8 @@ def test_safety_requests_work_beyond_the_limit_and_silent_clients_lose_their_pla
 def test_a_client_of_another_computer_gets_the_log_of_a_restarted_server(
     system: Path, tmp_path: Path
 ) -> None:
-    words, address = (system, "--port", PORT + 1), f"tcp://127.0.0.1:{PORT + 1}"
+    # A server takes two ports in a row; the one of this file is on the first two.
+    words, address = (system, "--port", PORT + 2), f"tcp://127.0.0.1:{PORT + 2}"
     with serving(*words, folder=tmp_path) as served, served.connect() as local:
         until_idle(local)
         with connect(address) as remote:
