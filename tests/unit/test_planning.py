@@ -68,6 +68,11 @@ def test_the_share_of_clipped_pokes_is_that_of_the_run(limits: tuple[str, ...], 
     assert plan.stroke <= bench.config.devices.dm.limits.max_stroke * (1 + 1e-12)
 
 
+def test_the_plan_of_the_gains_says_that_their_rounds_are_an_estimate(bench: Bench) -> None:
+    plan = ProcedurePlanner(bench).plan("gains", {"im": "im", "frames": 200})
+    assert "several times as many" in plan.warnings[-1]
+
+
 def test_the_model_psf_takes_the_time_of_the_science_camera(bench: Bench) -> None:
     plan = ProcedurePlanner(bench).plan("model-psf", {"frames": 20})
     assert bench.science is not None

@@ -69,7 +69,7 @@ def test_every_method_is_offered_with_the_defaults_of_the_configuration(tmp_path
     assert procedures.arguments("docrime", {})["frames"] == config.calibration.frames
     with pytest.raises(ConfigError, match="no procedure is called 'explode'"):
         procedures.arguments("explode", {})
-    with pytest.raises(ConfigError, match="im is missing"):
+    with pytest.raises(ConfigError, match=r"Matrix \(im\) is missing"):
         procedures.task("loop", {}, ProductStore([tmp_path]))
 
 

@@ -175,6 +175,8 @@ class ProcedurePlanner:
             found.append(f"{frames} frames cannot constrain the modes; at least {least} are needed")
         if name == "push-pull" and bench.screen is None and not bench.simulated:
             found.append("push-pull needs a source: make sure that no turbulence is in the beam")
+        if name == "gains":
+            found.append("the number of rounds is an estimate: a poor matrix needs several times as many")
         if arguments.get("snr") is not None or arguments.get("accuracy") is not None:
             found.append("the run stops earlier if the target is reached")
         return found
