@@ -198,7 +198,7 @@ def test_a_new_connection_does_not_wait_for_answers_of_the_one_before(
     assert requests._pending == 0
     requests.ask("flatten the mirror", lambda server: server.flatten(), urgent=True)
     qtbot.waitUntil(lambda: again.verbs == ["flatten"])
-    # The operator is told of the request without an answer; a late answer is discarded.
+    # The request without an answer is reported as failed; a late answer is discarded.
     with qtbot.waitSignal(requests.failed) as told:
         go_on.set()
     assert told.args[0] == "flatten the mirror"
