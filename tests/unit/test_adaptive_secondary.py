@@ -26,7 +26,7 @@ def twin(*overrides: str) -> SimAdaptiveSecondary:
 
 
 def wait(mirror: SimAdaptiveSecondary, seconds: float = 0.05) -> None:
-    mirror._bench.advance_to(mirror._bench.now_s + seconds)
+    mirror.twin.advance_to(mirror.twin.now_s + seconds)
 
 
 def test_opening_leads_to_running_and_closing_to_rest() -> None:

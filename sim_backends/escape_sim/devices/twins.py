@@ -59,6 +59,11 @@ class _Simulated(Generic[Info]):
         """Identity and fixed properties."""
         return self._info
 
+    @property
+    def twin(self) -> SimBench:
+        """The simulated bench with its true state; for tests and benchmarks only."""
+        return self._bench
+
     def now_ns(self) -> int:
         """Simulated time in nanoseconds."""
         return self._bench.now_ns
@@ -77,11 +82,6 @@ class SimMirror(_Simulated[DMInfo], DeformableMirror):
         super().__init__(name, bench.config.devices.dm.limits.to_limits())
         self._bench = bench
         self._info = bench.config.devices.dm.info("simulated ALPAO DM97-15", simulated=True)
-
-    @property
-    def twin(self) -> SimBench:
-        """The simulated bench with its true state; for tests and benchmarks only."""
-        return self._bench
 
     def _open(self) -> None:
         self._bench.set_positions(np.zeros(self._info.n_act))
