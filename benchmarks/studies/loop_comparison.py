@@ -282,9 +282,9 @@ def page(rows: Sequence[Line], title: str, raw: str) -> list[str]:
     ]  # fmt: skip
 
 
-def main() -> None:
-    """Measure what is missing, and print the table."""
-    parser = study_parser(__doc__, "razor-pywfs")
+def comparison_parser(description: str | None, system: str) -> argparse.ArgumentParser:
+    """The options of a comparison."""
+    parser = study_parser(description, system)
     parser.add_argument("--set", nargs="*", default=[])
     parser.add_argument("--seeds", nargs="+", type=int, default=list(range(1, 11)))
     parser.set_defaults(out=Path("paired"))
@@ -300,7 +300,17 @@ def main() -> None:
     parser.add_argument("--loop", type=int, default=1200, help="frames of each evaluated loop")
     parser.add_argument("--table", type=Path, help="folder of the raw table and its page; default: --out")
     parser.add_argument("--name", default="paired")
-    options = parser.parse_args()
+    return parser
+
+
+def complete_options(parser: argparse.ArgumentParser, options: argparse.Namespace) -> Line:
+    """Check and complete the options; the settings that every line keeps.
+
+    Raises
+    ------
+    SystemExit
+        The loops are too short for a Strehl ratio.
+    """
     config = load_system(options.system, overrides=options.set)
     science = config.devices.science or config.devices.wfs
     least = minimum_strehl_frames(config.devices.wfs.frame_rate_hz, science.frame_rate_hz)
@@ -309,7 +319,14 @@ def main() -> None:
     is_pyramid = isinstance(config.sensor, PyramidSection)
     options.gains = options.gains and is_pyramid
     keys = ("system", "set", "calibration", "short", "baseline", "gains", "scan", "loop")
-    asked = {key: getattr(options, key) for key in keys}
+    return {key: getattr(options, key) for key in keys}
+
+
+def main() -> None:
+    """Measure what is missing, and print the table."""
+    parser = comparison_parser(__doc__, "razor-pywfs")
+    options = parser.parse_args()
+    asked = complete_options(parser, options)
     until, stem = time.monotonic() + 60 * options.minutes, f"{options.system}-{options.name}"
     folder = options.table or options.out
     target = folder / f"{stem}.jsonl"
