@@ -55,6 +55,7 @@ def test_grab_frames(tmp_path: Path) -> None:
         assert (np.diff(kept["arrived_s"]) > 0).all()
 
 
+@pytest.mark.slow
 def test_calibrate(tmp_path: Path) -> None:
     out = run("calibrate.py", tmp_path)
     assert "SPRINT converged" in out
@@ -67,6 +68,7 @@ def test_calibrate(tmp_path: Path) -> None:
     assert number(r"radial_scaling: +(-?[\d.]+)", out) == pytest.approx(2.9, abs=0.15)
 
 
+@pytest.mark.slow
 def test_close_the_loop(tmp_path: Path) -> None:
     out = run("close_the_loop.py", tmp_path, "kept.fits")
     assert (tmp_path / "kept.fits").is_file()

@@ -43,6 +43,7 @@ def run_block(block: Block, reader: Reader) -> str:
 
 
 @pytest.mark.parametrize("page", RUN, ids=name_of)
+@pytest.mark.slow
 def test_a_page_can_be_followed(page: Path, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
     reader, printed = Reader(tmp_path, tmp_path_factory), ""
     for block in blocks_of(page):
@@ -85,6 +86,7 @@ def test_blocks_are_well_formed(page: Path) -> None:
             compile(block.text, str(page), "exec")
 
 
+@pytest.mark.slow
 def test_the_site_is_built_without_a_warning(tmp_path: Path) -> None:
     pytest.importorskip("sphinx", reason="pip install 'escape-hw[docs]'")
     words = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "-b", "html"]

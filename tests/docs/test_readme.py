@@ -34,6 +34,7 @@ def escape_lines() -> list[str]:
 
 
 @pytest.mark.parametrize("number", range(len(blocks("python"))))
+@pytest.mark.slow
 def test_python_blocks_run(number: int, tmp_path: Path) -> None:
     if "StandIn(" in blocks("python")[number] and not any(map(shutil.which, ("cc", "gcc", "clang"))):
         pytest.skip("stand-ins need a C compiler")
@@ -45,6 +46,7 @@ def test_python_blocks_run(number: int, tmp_path: Path) -> None:
 
 
 @pytest.mark.timeout(1500)
+@pytest.mark.slow
 def test_commands_run_in_the_order_they_stand(
     tmp_path: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> None:

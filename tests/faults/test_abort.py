@@ -128,6 +128,7 @@ def test_a_partial_docrime_is_a_good_matrix_with_correct_errors(good, place):
     assert np.mean(np.square(pulls)) < 4
 
 
+@pytest.mark.slow
 def test_a_reproduction_saves_the_finished_parts(good):
     stop = StopThere("loop at gain", 0.2)
     with small() as bench, pytest.raises(Aborted) as caught:
@@ -139,6 +140,7 @@ def test_a_reproduction_saves_the_finished_parts(good):
     assert not partial.loops
 
 
+@pytest.mark.slow
 def test_stopped_before_sprint_a_reproduction_keeps_no_escape_matrix(good):
     stop = StopThere("DO-CRIME", 0.01)
     with small() as bench, pytest.raises(Aborted) as caught:

@@ -54,6 +54,7 @@ def truth(closed_loop):
     return measure(closed_loop, frames=4000, poke=0.02)
 
 
+@pytest.mark.slow
 def test_a_tiny_poke_gives_the_same_matrix_as_a_large_one(closed_loop, truth):
     gains = []
     for seed in (1, 2):
@@ -84,6 +85,7 @@ def test_registration_from_tiny_pokes_in_closed_loop(closed_loop):
     assert (estimate.sigma < [0.6, 0.6, 0.04, 0.2, 0.2]).all()
 
 
+@pytest.mark.slow
 def test_fast_push_pull_in_closed_loop(closed_loop, truth):
     found = measure(closed_loop, frames=3000, pattern=PushPullPokes)
     gain, chi2 = compare(found, truth)
@@ -106,12 +108,20 @@ def test_fast_push_pull_under_turbulence_in_open_loop(good):
 @pytest.mark.parametrize(
     ("more", "allowed"),
     [
-        (("twin.loss_probability=0.05",), 0.03),
-        (("twin.vibration.amplitude_rad=[4e-6,2e-6]", "twin.vibration.frequency_hz=[37.0,111.0]"), 0.03),
-        (("devices.dm.limits.max_stroke=0.15",), 0.04),
-        (("devices.dm.limits.max_slew=0.03",), 0.04),
+        pytest.param(("twin.loss_probability=0.05",), 0.03, id="lost frames"),
+        pytest.param(
+            ("twin.vibration.amplitude_rad=[4e-6,2e-6]", "twin.vibration.frequency_hz=[37.0,111.0]"),
+            0.03,
+            id="vibration",
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(
+            ("devices.dm.limits.max_stroke=0.15",), 0.04, id="clipped by the stroke", marks=pytest.mark.slow
+        ),
+        pytest.param(
+            ("devices.dm.limits.max_slew=0.03",), 0.04, id="clipped by the slew", marks=pytest.mark.slow
+        ),
     ],
-    ids=["lost frames", "vibration", "clipped by the stroke", "clipped by the slew"],
 )
 def test_faults_that_bias_nothing(closed_loop, truth, more, allowed):
     found = measure(closed_loop, *more, frames=3000)
@@ -125,6 +135,7 @@ def test_faults_that_bias_nothing(closed_loop, truth, more, allowed):
         assert any("limits shortened" in note for note in found.notes)
 
 
+@pytest.mark.slow
 def test_unknown_failed_actuators_show_in_the_matrix(closed_loop, truth):
     """What the mirror no longer does is missing from the matrix, as in open loop, and the rest is right."""
     broken = (18, 25)
@@ -138,6 +149,7 @@ def test_unknown_failed_actuators_show_in_the_matrix(closed_loop, truth):
     assert compare(found, truth)[1] > 30
 
 
+@pytest.mark.slow
 def test_disabled_actuators(good):
     disabled = "devices.dm.limits.disabled=[3,18]"
     with small(NO_LOSS, disabled) as bench:
@@ -183,6 +195,7 @@ def test_the_light_is_lost(closed_loop):
         measure(closed_loop, prepare=lambda bench: bench.screen.set(blocked=True))
 
 
+@pytest.mark.slow
 def test_it_stops_at_the_requested_ratio(closed_loop):
     found = measure(closed_loop, frames=20_000, until=Target(snr=20.0))
     assert found.matrix.snr().min() >= 20
@@ -190,7 +203,8 @@ def test_it_stops_at_the_requested_ratio(closed_loop):
     assert not found.partial
 
 
-@pytest.mark.parametrize("in_loop", [pytest.param(True, marks=pytest.mark.slow), False])
+@pytest.mark.slow
+@pytest.mark.parametrize("in_loop", [True, False])
 def test_escape_stops_at_the_requested_accuracy(closed_loop, in_loop):
     with small(NO_LOSS) as bench:
         options = {"closing": closed_loop} if in_loop else {}

@@ -235,6 +235,7 @@ def test_too_few_frames_no_light_and_no_response_exit_1(run, system, tmp_path):
     assert "does not respond" in document["error"]["message"]
 
 
+@pytest.mark.slow
 def test_one_percent_of_lost_frames_changes_no_registration(run, system, tmp_path):
     found = {}
     for loss in (0.0, 0.01):
@@ -250,6 +251,7 @@ def test_one_percent_of_lost_frames_changes_no_registration(run, system, tmp_pat
         assert abs(value["value"] - other["value"]) < 4 * np.hypot(value["sigma"], other["sigma"]), name
 
 
+@pytest.mark.slow
 def test_the_same_command_twice_gives_the_same_numbers(run, tmp_path):
     sets = [word for key in SMALL for word in ("--set", key)]
     found = []

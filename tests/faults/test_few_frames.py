@@ -70,6 +70,7 @@ def test_the_registration_is_right_within_its_errors_or_reports_that_it_is_not(g
     assert np.mean(np.square(pulls)) < 4.5
 
 
+@pytest.mark.slow
 def test_the_full_bench_at_its_limit():
     from escape_hw.runtime.session.system import open_system
 

@@ -36,7 +36,14 @@ def pull(found) -> np.ndarray:
 
 @pytest.mark.parametrize("seeds", SEEDS, ids=["one", "four"])
 @pytest.mark.parametrize(
-    "name", ["as it is", "lost frames", "vibration", "a matrix half as large", "commands cut by the limits"]
+    "name",
+    [
+        "as it is",
+        "lost frames",
+        pytest.param("vibration", marks=pytest.mark.slow),
+        pytest.param("a matrix half as large", marks=pytest.mark.slow),
+        pytest.param("commands cut by the limits", marks=pytest.mark.slow),
+    ],
 )
 def test_right_within_its_errors_whatever_the_loop_does(closed_loop, name, seeds):
     more = {
@@ -65,6 +72,7 @@ def test_right_within_its_errors_whatever_the_loop_does(closed_loop, name, seeds
     assert np.mean(np.square(pulls)) < 3
 
 
+@pytest.mark.slow
 def test_smaller_pokes_and_more_frames_give_larger_errors_and_smaller_ones(closed_loop):
     strong, weak = measured(closed_loop), measured(closed_loop, poke=0.002)
     # Those between runs: the unequal actuators, in both alike, are most of the others.

@@ -57,11 +57,14 @@ def refused_or_not_converged(*more: str, seed: int) -> bool:
 @pytest.mark.parametrize(
     "more",
     [
-        ("twin.latency_s=0.006", "calibration.lags=3"),
-        ("twin.latency_s=0.006",),
-        ("devices.dm.stroke_m=1e-12",),
+        pytest.param(
+            ("twin.latency_s=0.006", "calibration.lags=3"),
+            id="answers after all lags",
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(("twin.latency_s=0.006",), id="answers with the last lag", marks=pytest.mark.slow),
+        pytest.param(("devices.dm.stroke_m=1e-12",), id="does not answer"),
     ],
-    ids=["answers after all lags", "answers with the last lag", "does not answer"],
 )
 def test_no_calibration_comes_of_it(more, seeds):
     for seed in seeds[:2]:

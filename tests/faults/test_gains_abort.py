@@ -25,7 +25,12 @@ class StopAt:
 
 
 @pytest.mark.parametrize(
-    ("stage", "frames", "rounds"), [("open loop", 50, 0), ("first closure", 10, 0), ("round 2", 700, 2)]
+    ("stage", "frames", "rounds"),
+    [
+        ("open loop", 50, 0),
+        ("first closure", 10, 0),
+        pytest.param("round 2", 700, 2, marks=pytest.mark.slow),
+    ],
 )
 def test_stopped(bench, good, tmp_path, stage, frames, rounds):
     stop = StopAt(stage, frames)

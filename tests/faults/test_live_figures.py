@@ -62,6 +62,7 @@ def test_open_loop_matrix_fills_in_and_costs_the_run_nothing(often):
     np.testing.assert_array_equal(matrix.sigma, unwatched.matrix.sigma)
 
 
+@pytest.mark.slow
 def test_closed_loop_matrix_fills_in(bench, good, often):
     result, shown = watched(bench, docrime_closed_loop(bench, good.run.result, frames=3000, poke=0.01))
     last, sigma = shown["matrix"][-1], shown["matrix_sigma"][-1]
@@ -101,6 +102,7 @@ def test_sprint_shows_every_iteration(bench, good, solver):
     np.testing.assert_allclose(course[-1], found.registration.to_array() * TO_STREAM_UNITS, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_gains_show_every_round(bench, good):
     procedure = bootstrap_gains(bench, good.run.result, accuracy=0.05, frames=1200)
     run, shown = watched(bench, procedure)
@@ -114,6 +116,7 @@ def test_gains_show_every_round(bench, good):
     np.testing.assert_allclose(shown["gains_rounds"][-1][-1], last.best, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_tracking_shows_its_course():
     with small(QUIET) as bench:
         start = bench.calibrate(frames=600)
@@ -151,6 +154,7 @@ def test_pictures_take_a_small_share_of_the_time(monkeypatch):
     assert 0.02 < sum(spent) / clock[0] < 0.05
 
 
+@pytest.mark.slow
 def test_a_run_too_short_for_a_matrix_has_live_maps(often):
     with small(QUIET) as bench:
         _, shown = watched(bench, calibrate_short_run(bench, frames=400))

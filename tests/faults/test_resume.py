@@ -49,8 +49,9 @@ def measure(good, name, path, *, resume=None, stop=True, more=()):
             assert_flat(bench)
 
 
-#: Its pokes apart, fast push-pull is DO-CRIME.
-EVERY = [pytest.param(name, marks=pytest.mark.slow) if name == "push-pull-fast" else name for name in CASES]
+#: The other cases share the code of these. Fast push-pull is DO-CRIME with other pokes.
+QUICK = ("push-pull", "docrime")
+EVERY = [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in CASES]
 
 
 @pytest.mark.parametrize("name", EVERY)

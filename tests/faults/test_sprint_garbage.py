@@ -113,6 +113,7 @@ def test_zeros_and_infinities(good, value, where, match):
             sprint(replace(good.matrix, data=data, sigma=sigma), good.model)
 
 
+@pytest.mark.slow
 def test_one_half_of_the_slopes_dead(good):
     """Nothing from y: without errors it must not pass for a scaling; with them it may be recovered."""
     data = good.matrix.data.copy()

@@ -97,6 +97,7 @@ def test_a_drift_is_followed_and_exchanged_without_a_transient(start, monkeypatc
         assert residual[after].max() < 1.5 * residual[before].max()
 
 
+@pytest.mark.slow
 def test_proposals_alone_change_nothing(start):
     with small(QUIET, "twin.drift.rate.shift_x=2.0") as bench:
         found = followed(bench, start, 5, exchange=False)
@@ -110,6 +111,7 @@ def test_proposals_alone_change_nothing(start):
     )
 
 
+@pytest.mark.slow
 def test_what_was_fitted_beside_the_registration_stays(start):
     extras = {"anamorphosis": Estimate(0.4, 0.1, "% of the diameter")}
     told = replace(start, registration=replace(start.registration, extras=extras))
@@ -122,6 +124,7 @@ def test_what_was_fitted_beside_the_registration_stays(start):
     assert stayed["anamorphosis"].sigma < 0.15
 
 
+@pytest.mark.slow
 def test_a_matrix_without_a_registration_is_fitted_as_configured(start):
     with small(QUIET, 'calibration.extra_parameters=["anamorphosis"]') as bench:
         found = followed(bench, replace(start, registration=None), 2, exchange=False)
@@ -129,6 +132,7 @@ def test_a_matrix_without_a_registration_is_fitted_as_configured(start):
     assert abs(found.column("shift_x")[-1] - start.registration.registration.shift_x) < 3
 
 
+@pytest.mark.slow
 def test_too_large_a_change_is_not_exchanged_without_asking(start):
     with small(QUIET, "twin.drift.rate.shift_x=3.0", "tracking.exchange_limit=0.02") as bench:
         found = followed(bench, start, 5)
@@ -136,6 +140,7 @@ def test_too_large_a_change_is_not_exchanged_without_asking(start):
     assert not any(one.accepted for one in found.exchanges)
 
 
+@pytest.mark.slow
 def test_a_jump_raises_an_alarm_and_is_found_again(start):
     def jump(twin):
         there = Registration.from_array(twin.flexure.at(0.0).to_array() + JUMP)
@@ -156,6 +161,7 @@ def test_a_jump_raises_an_alarm_and_is_found_again(start):
     assert not [one for one in found.exchanges if 0 <= one.seconds - found.alarms[0].seconds <= 4]
 
 
+@pytest.mark.slow
 def test_a_failed_actuator_raises_an_alarm_that_no_registration_explains(start):
     def die(twin):
         send = twin.dynamics.command
@@ -173,13 +179,14 @@ def test_a_failed_actuator_raises_an_alarm_that_no_registration_explains(start):
     assert found.alarms[0].seconds > 7
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "more",
     [
         "twin.loss_probability=0.05",
         "twin.vibration.amplitude_rad=[4e-6,2e-6]",
         "devices.dm.limits.max_stroke=0.12",
-        pytest.param("devices.dm.limits.max_slew=0.03", marks=pytest.mark.slow),
+        "devices.dm.limits.max_slew=0.03",
     ],
     ids=["lost frames", "vibration", "clipped by the stroke", "clipped by the slew"],
 )
@@ -198,6 +205,7 @@ def test_faults_that_bias_nothing(start, more):
         assert not found.alarms
 
 
+@pytest.mark.slow
 def test_a_wrong_delay_is_told_and_the_measured_one_taken(start):
     late = TemporalResponse(np.roll(start.response.weights, 1), start.response.sigma)
     with small(QUIET) as bench:
@@ -212,6 +220,7 @@ def test_a_wrong_delay_is_told_and_the_measured_one_taken(start):
     assert found.optical_gain.mean() == pytest.approx(1, abs=0.1)
 
 
+@pytest.mark.slow
 def test_a_script_tracks_what_it_calibrated(start):
     with small(QUIET) as bench:
         found = bench.track(start, seconds=2, poke=0.003, exchange=False)
@@ -244,6 +253,7 @@ def test_a_loop_that_runs_away_is_opened_and_reported(start):
     assert found.latest is not None
 
 
+@pytest.mark.slow
 def test_when_stopped_it_saves_its_data(start):
     stop = threading.Event()
     with small(QUIET) as bench:
@@ -258,6 +268,7 @@ def test_when_stopped_it_saves_its_data(start):
     assert found.to_csv().count("\n") == len(found.rows["seconds"]) + 1
 
 
+@pytest.mark.slow
 def test_the_command_leaves_table_matrix_and_report(start, tmp_path, capsys):
     system, im = tmp_path / "small.toml", tmp_path / "im.fits"
     system.write_text(configuration(QUIET, "twin.drift.rate.shift_x=1.0").to_toml())

@@ -106,6 +106,7 @@ def in_front(window: MainWindow) -> set[str]:
     ("workspace", "more"),
     [("align", set()), ("calibrate", {"log", "camera", "gains"}), ("operate", {"log", "mirror", "trends"})],
 )
+@pytest.mark.slow
 def test_a_large_window_shows_more_panels_at_once(workspace: str, more: set[str], show: Show) -> None:
     window = show(Settings(workspace=workspace))
     window.resize(1280, 760)
@@ -123,6 +124,7 @@ def test_a_large_window_shows_more_panels_at_once(workspace: str, more: set[str]
     assert (window.width(), window.height()) == (1280, 760)
 
 
+@pytest.mark.slow
 def test_layouts_of_large_and_small_windows_are_kept_apart(show: Show, tmp_path) -> None:
     window = show(Settings(workspace="operate"))
     window.resize(2560, 1400)
@@ -144,6 +146,7 @@ def test_layouts_of_large_and_small_windows_are_kept_apart(show: Show, tmp_path)
     assert again == pytest.approx(widths, rel=0.1)
 
 
+@pytest.mark.slow
 def test_the_focus_stays_when_the_window_becomes_large_or_small(show: Show) -> None:
     window = show(Settings(workspace="operate"))
     window.resize(1280, 760)
@@ -166,6 +169,7 @@ def test_the_focus_stays_when_the_window_becomes_large_or_small(show: Show) -> N
     assert window.focusWidget() is window
 
 
+@pytest.mark.slow
 def test_a_large_window_is_arranged_anew_for_larger_fonts(show: Show) -> None:
     window = show(Settings(workspace="operate"))
     window.resize(2560, 1400)
@@ -187,6 +191,7 @@ def test_a_large_window_is_arranged_anew_for_larger_fonts(show: Show) -> None:
 
 
 @pytest.mark.parametrize("workspace", [one.name for one in WORKSPACES])
+@pytest.mark.slow
 def test_a_layout_is_the_same_after_the_window_had_another_size(workspace: str, show: Show) -> None:
     window = show(Settings(workspace=workspace))
 
@@ -210,6 +215,7 @@ def test_a_layout_is_the_same_after_the_window_had_another_size(workspace: str, 
 
 
 @pytest.mark.parametrize("workspace", [one.name for one in WORKSPACES])
+@pytest.mark.slow
 def test_a_layout_is_scaled_to_a_window_that_was_large_meanwhile(workspace: str, show: Show) -> None:
     window = show(Settings(workspace=workspace))
     sizes = []

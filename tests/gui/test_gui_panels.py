@@ -230,6 +230,7 @@ def test_performance_survives_the_end_of_the_engine(window: MainWindow, source: 
     assert table.data[1, 1:] == pytest.approx([36.5, 44.0])
 
 
+@pytest.mark.slow
 def test_hours_of_performance_need_little_memory_and_are_shown_in_hours(
     window: MainWindow, source: ScriptedSource
 ) -> None:

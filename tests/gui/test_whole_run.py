@@ -52,6 +52,7 @@ def small(tmp_path: Path) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_escape_through_the_buttons(small: Path, tmp_path: Path) -> None:
     with operating(small, tmp_path) as operator:
         operator.take_control()

@@ -38,6 +38,7 @@ def test_every_basis_gives_the_registration(kind):
     assert result.matrix.m2c.shape == (37, 25)
 
 
+@pytest.mark.slow
 def test_a_basis_from_a_file_is_the_basis(tmp_path):
     from escape_hw.io.fits.matrix import save_matrix
     from escape_hw.runtime.session.record import BenchRecord
@@ -50,6 +51,7 @@ def test_a_basis_from_a_file_is_the_basis(tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["zernike", "fourier"])
+@pytest.mark.slow
 def test_few_frames_do_with_any_basis(kind):
     result = calibrated(f"basis.kind={kind}", frames=40)
     assert result.measured is None
@@ -66,5 +68,6 @@ def test_every_solver_gives_the_registration(solver):
 
 
 @pytest.mark.parametrize("pokes", ["anticorrelated", "equal-snr"])
+@pytest.mark.slow
 def test_every_kind_of_poke_gives_the_registration(pokes):
     calibrated(f"calibration.pokes={pokes}", frames=60)

@@ -82,6 +82,7 @@ def test_a_shear_is_recovered_within_its_error(model):
     assert all(blind)
 
 
+@pytest.mark.slow
 def test_where_there_is_no_shear_asking_for_one_does_no_harm(model):
     pulls, wider = [], []
     for seed in SEEDS:
@@ -165,6 +166,7 @@ def test_shifted_pupil_images_are_distinguished_from_a_shifted_mirror_by_their_r
     assert np.abs(pulls).max() < 6
 
 
+@pytest.mark.slow
 def test_on_the_twin_an_injected_shear_is_recovered_and_reported():
     pulls = []
     for seed in (1, 2, 3):

@@ -101,6 +101,7 @@ def test_a_well_measured_mirror_is_recovered(design: Design) -> None:
     assert (found < 0.25 * nominal).all()
 
 
+@pytest.mark.slow
 def test_a_mirror_with_a_large_pedestal_is_recovered(design: Design) -> None:
     errors = []
     for seed in SEEDS:
@@ -165,6 +166,7 @@ def test_nominal_is_the_matrix_of_the_nominal_mirror(design: Design) -> None:
 
 
 @pytest.mark.parametrize("frames", [50, 400])
+@pytest.mark.slow
 def test_a_tenth_of_a_second_determines_unequal_actuators(frames: int) -> None:
     """The whole bench, compared with push-pull without turbulence."""
     errors = []

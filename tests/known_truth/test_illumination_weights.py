@@ -64,7 +64,10 @@ def errors(selective: bool, solver: Solver = "mixed-effects") -> NDArray[np.floa
     return np.array(out)
 
 
-@pytest.mark.parametrize("solver", ["mixed-effects", "registration-only", "frozen-derivatives"])
+@pytest.mark.parametrize(
+    "solver",
+    [pytest.param("mixed-effects", marks=pytest.mark.slow), "registration-only", "frozen-derivatives"],
+)
 def test_slopes_of_small_weight_do_not_move_the_registration(solver: Solver) -> None:
     with_all, without = (np.sqrt(np.mean(np.square(errors(one, solver)), axis=0)) for one in (False, True))
     # Scaling along x, the way the contaminated pixels look; a clean fit errs by hundredths of a per cent.

@@ -129,6 +129,7 @@ def test_the_product_is_read_back(found: InfluenceEstimate, tmp_path: Path) -> N
         load_matrix(path)
 
 
+@pytest.mark.slow
 def test_the_registration_keeps_its_profile_on_disk(product: Path, estimate: RegistrationEstimate) -> None:
     read = load_matrix(product).registration
     assert read is not None

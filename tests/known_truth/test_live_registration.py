@@ -68,7 +68,8 @@ def realisation(number, *more):
     return open_system(SYSTEM, set=[*registration, *more], seed=number + 1)
 
 
-@pytest.mark.parametrize("number", [1, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [1, 2])
 def test_any_controller_gives_the_same(number):
     truth, start = random_registration(number), None
     with System.from_config(configuration(*registration_overrides(truth), seed=number)) as bench:
@@ -90,6 +91,7 @@ def test_the_matrix_it_fits_answers_as_the_bench_does():
     assert share == pytest.approx(1.0, abs=0.03)
 
 
+@pytest.mark.slow
 def test_the_pyramid_has_gains_by_mode():
     with small_pyramid("twin.loss_probability=0") as bench:
         truth = bench.dm.twin.flexure.at(0.0)
@@ -111,7 +113,8 @@ def injected(truth, *more, seed):
     return System.from_config(configuration(*realisations, *more, seed=seed))
 
 
-@pytest.mark.parametrize("number", [3, pytest.param(1, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [3, 1])
 def test_a_sheared_mirror_is_found_beside_the_registration(number):
     """Without the shear among the fitted parameters the slopes are explained less well."""
     truth = random_registration(number)

@@ -56,6 +56,7 @@ def test_frames_are_faint_but_not_dark_nor_saturated(system):
     assert passed.sum() < 0.99 * (passed > 0).sum()
 
 
+@pytest.mark.slow
 def test_pupils_are_found_where_they_are(system, found):
     sensor, hidden = system.config.sensor, system.config.twin.pyramid
     centres = np.add(sensor.pupils_px, hidden.centre_offsets_px)
@@ -63,6 +64,7 @@ def test_pupils_are_found_where_they_are(system, found):
     assert np.abs((found.grid.centres_px - centres).mean(axis=0)).max() < 0.3
 
 
+@pytest.mark.slow
 def test_the_matrix_has_the_hidden_registration(system, found):
     model = make_fast_model(system.config, found.grid)
     matrix = found.matrix
@@ -83,6 +85,7 @@ def test_disabled_actuators_take_no_part(system, found):
     assert not found.matrix.m2c[disabled].any()
 
 
+@pytest.mark.slow
 def test_the_loop_closes_on_the_star(system, found):
     model = system.take_model_psf()
     run = system.close_loop(found.matrix, found.grid, frames=500, model_psf=model)

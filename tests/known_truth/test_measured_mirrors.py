@@ -48,6 +48,7 @@ def test_the_fit_of_a_measured_mirror_converges(date: str) -> None:
     assert left < 0.08
 
 
+@pytest.mark.slow
 def test_matrices_minutes_apart_agree() -> None:
     (_, a), (second, b) = fitted(DATES[0]), fitted("20230901151656")
     difference = a.estimate.registration.to_array() - b.estimate.registration.to_array()
@@ -64,6 +65,7 @@ def test_matrices_minutes_apart_agree() -> None:
     assert left < 0.08
 
 
+@pytest.mark.slow
 def test_broken_lenslets_are_named() -> None:
     estimate = fitted("20230724164246")[1].estimate
     assert not estimate.converged
@@ -78,6 +80,7 @@ def test_a_mirror_that_did_not_move_is_refused() -> None:
     assert "does the mirror move" in estimate.warnings[0]
 
 
+@pytest.mark.slow
 def test_an_actuator_whose_gain_changes_is_named() -> None:
     gains = [
         fitted(date)[1].estimate.actuator_corrections.gain for date in ("20230927150437", "20230927151155")

@@ -96,6 +96,7 @@ def errors(estimates: list[RegistrationEstimate]) -> np.ndarray:
     return np.array([one.registration.to_array() - INJECTED.to_array() for one in estimates])
 
 
+@pytest.mark.slow
 def test_measured_functions_are_as_accurate_as_the_gaussian_family(
     nominal: ShackHartmannModel, m2c: np.ndarray, tmp_path: Path
 ) -> None:

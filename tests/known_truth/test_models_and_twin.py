@@ -39,8 +39,8 @@ SENSORS = {
 SOMEWHERE = Registration(-16.0, 31.0, -0.77, 2.9, 0.5)
 
 
-@pytest.mark.parametrize("sensor", SENSORS)
-@pytest.mark.parametrize("model", ["fast", "oopao"])
+@pytest.mark.parametrize("sensor", ["lenslets", pytest.param("pyramid", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("model", ["fast", pytest.param("oopao", marks=pytest.mark.slow)])
 def test_no_model_reads_the_twin(sensor, model):
     system, design, hidden = SENSORS[sensor]
     if (sensor, model) == ("pyramid", "oopao"):

@@ -27,6 +27,7 @@ def test_importing_the_twin_does_not_import_oopao():
     assert done.stdout.split() == ["False", "False"], done.stderr
 
 
+@pytest.mark.slow
 def test_nothing_is_printed_and_nothing_drawn():
     done = _run(
         "import tomllib\n"

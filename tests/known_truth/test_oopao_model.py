@@ -56,6 +56,7 @@ def test_both_are_synthetic_models(oopao, fast):
 
 
 @pytest.mark.parametrize("registration", [Registration(), Registration(90.0, 80.0, 2.0, -4.0, 4.0)])
+@pytest.mark.slow
 def test_matrices_are_equal(oopao, fast, registration):
     theirs = oopao.zonal_matrix(registration)
     assert theirs.shape == (theirs.shape[0], 97)
@@ -63,20 +64,22 @@ def test_matrices_are_equal(oopao, fast, registration):
     assert difference(fast.zonal_matrix(registration), theirs) < TOLERANCE
 
 
+@pytest.mark.slow
 def test_matrices_are_equal_for_another_width(oopao, fast):
     theirs = oopao.zonal_matrix(PAPER, 1.05)
     assert difference(fast.zonal_matrix(PAPER, 1.05), theirs) < TOLERANCE
     assert difference(fast.zonal_matrix(PAPER), theirs) > 1e-2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "step"),
     [
         ("rotation", 0.2),
-        pytest.param("shift_x", 2.0, marks=pytest.mark.slow),
-        pytest.param("shift_y", 2.0, marks=pytest.mark.slow),
-        pytest.param("radial_scaling", 0.5, marks=pytest.mark.slow),
-        pytest.param("tangential_scaling", 0.5, marks=pytest.mark.slow),
+        ("shift_x", 2.0),
+        ("shift_y", 2.0),
+        ("radial_scaling", 0.5),
+        ("tangential_scaling", 0.5),
     ],
 )
 def test_sensitivities_are_equal(oopao, fast, name, step):
@@ -86,6 +89,7 @@ def test_sensitivities_are_equal(oopao, fast, name, step):
     assert difference(ours, theirs) < 10 * TOLERANCE
 
 
+@pytest.mark.slow
 def test_matrices_are_equal_on_a_grid_found_elsewhere(config, fast):
     nominal = nominal_grid(config)
     valid = nominal.valid.copy()
@@ -148,6 +152,7 @@ def test_the_matrix_is_that_of_oopao_itself(config, oopao, paper):
     assert gain.std() < 0.05
 
 
+@pytest.mark.slow
 def test_the_matrix_does_not_depend_on_the_order_of_calls(oopao, fast, paper):
     assert difference(fast.zonal_matrix(PAPER), paper) < TOLERANCE
     oopao.zonal_matrix(Registration(50.0, 0.0, 1.0, 0.0, 0.0), 0.9)

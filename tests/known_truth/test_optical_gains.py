@@ -127,6 +127,7 @@ def gains_of(run: GainsRun) -> OpticalGains:
     return run.result.gains
 
 
+@pytest.mark.slow
 def test_bootstrap_converges_from_any_scale_to_the_same_matrix(
     bench: System, baseline: CalibrationResult, opened: CalibrationResult
 ) -> None:
@@ -174,6 +175,7 @@ def test_a_mirror_out_of_the_beam_is_reported(bench: System, baseline: Calibrati
     assert not bench.dm.shape.any()
 
 
+@pytest.mark.slow
 def test_turbulence_beyond_the_sensor_is_reported(baseline: CalibrationResult) -> None:
     # The strongest screen, whose r0 is a seventh of an actuator's pitch.
     with small(DIM, "devices.screen.screen=0", "sensor.modulation=3.0") as bench:
@@ -198,6 +200,7 @@ def test_numbers_that_mean_nothing_and_strangers_are_refused(
         bench.run(bootstrap_gains(bench, baseline, comparisons={"pp": stranger}))
 
 
+@pytest.mark.slow
 def test_the_command_keeps_gains_and_matrix(
     bench: System, baseline: CalibrationResult, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -227,6 +230,7 @@ def test_the_command_keeps_gains_and_matrix(
     assert "Optical gains" in page
 
 
+@pytest.mark.slow
 def test_another_matrix_lends_its_shape(
     bench: System, baseline: CalibrationResult, opened: CalibrationResult
 ) -> None:
@@ -251,6 +255,7 @@ def test_another_matrix_lends_its_shape(
     assert np.median(gains_of(run).best) > 1
 
 
+@pytest.mark.slow
 def test_only_a_matrix_of_the_model_has_a_shape_for_a_flat_wavefront(
     bench: System, baseline: CalibrationResult
 ) -> None:

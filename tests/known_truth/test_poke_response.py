@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from escape_hw.api.registration import Registration
 from escape_hw.calibration.sprint.tip_tilt import TipTiltFreeModel
@@ -15,6 +16,7 @@ from escape_sim.models.shack_hartmann import ShackHartmannModel, nominal_grid
 STUDIES = Path(__file__).parents[2] / "benchmarks" / "studies"
 
 
+@pytest.mark.slow
 def test_shift_from_images_of_pokes(monkeypatch):
     monkeypatch.syspath_prepend(STUDIES)
     from lenslet_pokes import run_realisation
@@ -25,6 +27,7 @@ def test_shift_from_images_of_pokes(monkeypatch):
     assert np.abs(row["nominal"]["error"][:2]).max() > 0.15
 
 
+@pytest.mark.slow
 def test_only_dense_actuators_and_random_pokes_have_such_a_response():
     revolt, razor = (load_system(name) for name in ("revolt-shwfs", "razor-shwfs"))
     m2c = np.eye(revolt.devices.dm.n_act, 3)

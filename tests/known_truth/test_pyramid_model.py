@@ -140,6 +140,7 @@ def test_screens_have_the_structure_function_of_turbulence():
 
 
 @pytest.mark.parametrize("ratio", [3.0, 8.0])
+@pytest.mark.slow
 def test_mean_derivatives_are_those_of_frames_under_turbulence(ratio):
     bare = Bare(radius=1.0)
     screens, number, step = Screens(12, ratio), 200, 1e-2
@@ -181,7 +182,7 @@ VARIETIES = {
 }
 
 
-@pytest.mark.parametrize("variety", VARIETIES)
+@pytest.mark.parametrize("variety", [pytest.param("modulated", marks=pytest.mark.slow), "still", "local"])
 def test_matrices_equal_those_of_oopao(variety):
     config = configuration(*VARIETIES[variety])
     for registration, width in ((Registration(), 1.0), (INJECTED, 1.1)):

@@ -90,6 +90,7 @@ def test_a_longer_recording_moves_centres_and_nothing_else() -> None:
     assert better.references is first.references
 
 
+@pytest.mark.slow
 def test_parts_of_a_run_give_the_error_of_the_images_position() -> None:
     pulls = []
     for seed in range(3):

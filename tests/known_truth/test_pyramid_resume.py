@@ -15,6 +15,7 @@ from escape_hw.runtime.procedures.calibration import calibrate_with_method
 FRAMES = 400
 
 
+@pytest.mark.slow
 def test_resumed_run_starts_the_modulator(tmp_path, monkeypatch):
     monkeypatch.setattr("escape_hw.api.procedure.Reporter.PERIOD_S", 0.0)
     abort = threading.Event()

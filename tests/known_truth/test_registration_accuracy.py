@@ -41,6 +41,7 @@ def test_registrations_fill_their_ranges_and_differ() -> None:
     assert (drawn.std(axis=0) > 0.5 * HALF_RANGES).all()
 
 
+@pytest.mark.slow
 def test_three_hundred_frames_meet_the_goal(few: Sequence[RealisationErrors]) -> None:
     curves = summary(few, (300,))
     assert _meets_goal(curves, "whitened", 300)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from functools import cache
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 from small_matrices import CONFIG, GRID, MODEL, measured
 
@@ -38,6 +39,7 @@ def test_runs_of_a_set_up_agree_within_their_repeatability():
     assert (sigma < 0.5 * runs[0].sigma).all()
 
 
+@pytest.mark.slow
 def test_noise_common_to_a_column_counts():
     assert (between_runs(fitted(0, 1.0)) > 1.5 * between_runs(fitted(0))).any()
 

@@ -24,6 +24,7 @@ def found(system):
     return system.calibrate("escape", frames=500)
 
 
+@pytest.mark.slow
 def test_the_lenslets_are_those_of_the_public_configuration(system, found):
     assert found.grid.n_valid == 188
     assert np.array_equal(found.grid.valid, system.config.sensor.valid_map())
@@ -34,6 +35,7 @@ def test_the_lenslets_are_those_of_the_public_configuration(system, found):
 
 
 @pytest.mark.parametrize("frames", CONTROLLERS)
+@pytest.mark.slow
 def test_the_delay_of_each_controller_is_found(frames):
     changes = [*FEW, f"twin.latency_s={CONTROLLERS[frames]}"]
     with escape_hw.open_system("revolt-shwfs", seed=4, set=changes) as system:
@@ -42,6 +44,7 @@ def test_the_delay_of_each_controller_is_found(frames):
     assert response.delay_frames == pytest.approx(frames, abs=0.4)
 
 
+@pytest.mark.slow
 def test_the_loop_closes_on_the_star(system, found):
     model = system.take_model_psf()
     run = system.close_loop(found, frames=300, model_psf=model, gain=0.4)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 import escape_hw
 from escape_hw.calibration.docrime.open_loop import docrime
@@ -13,6 +14,7 @@ from escape_hw.io.fits.matrix import load_matrix, save_matrix
 from escape_hw.runtime.session.record import BenchRecord
 
 
+@pytest.mark.slow
 def test_registration_from_the_file_is_that_from_memory(tmp_path: Path) -> None:
     with escape_hw.open_system("razor-shwfs", seed=3) as bench:
         measured = bench.run(docrime(bench, frames=300))

@@ -19,6 +19,7 @@ FRAMES = 3000
 
 
 @pytest.mark.parametrize("screen", [2, 1])
+@pytest.mark.slow
 def test_the_strength_of_the_turbulence_is_that_of_the_screen(screen: int):
     # Commands are converted to surfaces by the nominal mirror; with the one drawn from this seed on a mirror
     # like a DM97 the weaker turbulence is found as 7.0 (true: 9.6).

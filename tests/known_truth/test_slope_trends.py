@@ -91,6 +91,7 @@ def test_an_injected_trend_is_recovered(model: PyramidModel) -> None:
     assert np.mean(np.square(pulls)) < 2.0
 
 
+@pytest.mark.slow
 def test_a_trend_is_not_fitted_as_a_scaling(model: PyramidModel) -> None:
     # The same noise and the same mirror, with and without a trend.
     def moved(one: object) -> NDArray[np.float64]:
@@ -108,6 +109,7 @@ def test_a_trend_is_not_fitted_as_a_scaling(model: PyramidModel) -> None:
     assert (np.abs(with_unknown[3:]) < 0.03).all()
 
 
+@pytest.mark.slow
 def test_no_trend_is_found_where_there_is_none(model: PyramidModel) -> None:
     found = []
     for seed in SEEDS:

@@ -145,6 +145,7 @@ def lattice(n: int, step: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("motion_px", [0.5, 1.1])
+@pytest.mark.slow
 def test_motion_averages_over_where_the_spots_are(config, motion_px):
     grid, cut = with_counts(config)
     grid = replace(grid, motion_px=motion_px)
@@ -157,6 +158,7 @@ def test_motion_averages_over_where_the_spots_are(config, motion_px):
     assert np.linalg.norm(still - want) > 0.02 * size
 
 
+@pytest.mark.slow
 def test_noise_makes_the_threshold_gradual(config):
     grid, cut = with_counts(config)
     counts_per_light = config.sensor.threshold * 1023 / cut

@@ -64,6 +64,7 @@ def test_converges_from_large_misregistrations(model, matrix_at, injected):
     assert estimate.chi2 == pytest.approx(1.0, abs=0.1)
 
 
+@pytest.mark.slow
 def test_a_shift_by_more_than_a_pitch_is_not_reported_as_converged(model, matrix_at):
     injected = Registration(shift_x=400.0)
     few = {"modes": 20, "coarse_search": False}
@@ -82,7 +83,9 @@ def random_far(number):
     )
 
 
-@pytest.mark.parametrize("solver", ["registration-only", "mixed-effects"])
+@pytest.mark.parametrize(
+    "solver", ["registration-only", pytest.param("mixed-effects", marks=pytest.mark.slow)]
+)
 def test_two_pitches_away_turned_and_scaled(model, matrix_at, solver):
     for number in range(4):
         injected = random_far(number)
@@ -92,7 +95,8 @@ def test_two_pitches_away_turned_and_scaled(model, matrix_at, solver):
         assert (np.abs(error) < 5 * estimate.sigma).all(), injected
 
 
-@pytest.mark.parametrize("n_modes", [5, pytest.param(40, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("n_modes", [5, 40])
 def test_random_registrations_are_recovered_or_refused(model, matrix_at, n_modes):
     """Anywhere within three pitches and far beyond: what is called converged is right."""
     found = 0
@@ -109,6 +113,7 @@ def test_random_registrations_are_recovered_or_refused(model, matrix_at, n_modes
     assert found >= 4
 
 
+@pytest.mark.slow
 def test_high_modes_alone_are_found_by_many_starts(model, matrix_at):
     injected = Registration(shift_x=400.0, shift_y=-250.0, rotation=4.0)
     columns = np.arange(20, 25)
@@ -137,6 +142,7 @@ def test_a_small_learning_rate_converges(model, matrix_at):
     assert (np.abs(estimate.registration.to_array() - PAPER.to_array()) < 4 * estimate.sigma).all()
 
 
+@pytest.mark.slow
 def test_a_mirror_of_the_other_polarity_is_pointed_out(model, matrix_at):
     matrix = matrix_at(PAPER)
     for solver in ("registration-only", "mixed-effects"):
@@ -145,6 +151,7 @@ def test_a_mirror_of_the_other_polarity_is_pointed_out(model, matrix_at):
         assert any("polarity" in warning for warning in estimate.warnings)
 
 
+@pytest.mark.slow
 def test_a_flip_is_named(model, matrix_at):
     matrix = matrix_at(PAPER)
     n = matrix.n_slopes // 2

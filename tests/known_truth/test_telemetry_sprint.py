@@ -31,6 +31,7 @@ def fifty() -> list[tuple[np.ndarray, CalibrationResult]]:
     return [_calibrate(number, 50, *GAUSSIAN_TWIN) for number in (0, 1)]
 
 
+@pytest.mark.slow
 def test_a_tenth_of_a_second_meets_the_goal_on_every_realisation(fifty):
     for errors, result in fifty:
         assert (np.abs(errors) <= 2 * GOAL).all(), errors

@@ -53,6 +53,7 @@ PLACES = {
         ["docrime_short", "escape_short"], ["docrime_long"],
     ),
 }  # fmt: skip
+QUICK = ("push-pull", "DO-CRIME", "closed loop")
 
 
 def check_products(folder: Path, whole: list[str], partial: list[str]) -> None:
@@ -66,7 +67,10 @@ def check_products(folder: Path, whole: list[str], partial: list[str]) -> None:
         assert load(folder / name).result.partial == name.endswith(".partial.fits")
 
 
-@pytest.mark.parametrize("place", PLACES)
+@pytest.mark.parametrize(
+    "place",
+    [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in PLACES],
+)
 def test_ctrl_c_in(start, system, im, tmp_path, place):
     words, line, pause, whole, partial = PLACES[place]
     out = tmp_path / "run"
@@ -151,6 +155,7 @@ def test_impatient_ctrl_c_never_leaves_half_a_product(start, system, tmp_path, p
     assert "did not close cleanly" not in (out / "run.log").read_text()
 
 
+@pytest.mark.slow
 def test_what_was_kept_can_be_used(start, escape, system, tmp_path):
     """The matrix of an aborted run closes a loop, gives a registration and fills a report."""
     out = tmp_path / "run"
@@ -168,6 +173,7 @@ def test_what_was_kept_can_be_used(start, escape, system, tmp_path):
     assert "ABORTED" in (out / "report.html").read_text().upper()
 
 
+@pytest.mark.slow
 def test_a_hang_up_is_ignored_under_nohup(start, system, tmp_path):
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
@@ -179,6 +185,7 @@ def test_a_hang_up_is_ignored_under_nohup(start, system, tmp_path):
     assert running.stop(signal.SIGHUP).code == 0
 
 
+@pytest.mark.slow
 def test_a_terminal_that_closes_saves_the_data(system, environment, tmp_path):
     """As a closed window or a lost ssh connection: a hang-up, and streams that fail from then on."""
     out = tmp_path / "run"

@@ -48,6 +48,7 @@ def other_user() -> tuple[str, ...]:
         ("docrime", "unreadable"),
     ],
 )
+@pytest.mark.slow
 def test_a_home_that_cannot_be_used(homes, other_user, im, system, tmp_path, words, home):
     command = {
         "show IM": ("show", "im.fits"),

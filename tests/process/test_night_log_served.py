@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import pytest
 from serving import serving, until_idle, wait_for
 
 from escape_hw.io.night_log import find_nights, read_night
 from escape_hw.runtime.session.recordings import find_recordings
 
 
+@pytest.mark.slow
 def test_notes_and_events_survive_the_front_end(system, tmp_path) -> None:
     with serving(system, folder=tmp_path) as served, served.connect(control=True) as client:
         until_idle(client)

@@ -26,6 +26,7 @@ def test_a_folder_that_cannot_be_used_is_refused(
     assert option[1] in error["message"]
 
 
+@pytest.mark.slow
 def test_runs_of_a_later_server_have_other_names_and_earlier_matrices_are_loaded(
     system: Path, tmp_path: Path
 ) -> None:

@@ -170,6 +170,7 @@ def test_a_closed_loop_is_closed_again_after_a_procedure_with_a_loop_of_its_own(
     assert not bench.state.loop.closed
 
 
+@pytest.mark.slow
 def test_sprint_on_a_stored_matrix(bench: Connection, matrix: str) -> None:
     plan = bench.plan("sprint", {"im": matrix})
     assert (plan.frames, plan.stroke) == (0, 0.0)
@@ -184,6 +185,7 @@ def test_sprint_on_a_stored_matrix(bench: Connection, matrix: str) -> None:
     assert made[f"sprint-{run.id}-im"].startswith("docrime")
 
 
+@pytest.mark.slow
 def test_gains_and_the_matrix_that_they_scale_both_stay_in_the_store(bench: Connection, matrix: str) -> None:
     run = bench.start("gains", im=matrix, frames=300, accuracy=0.5, strehl=False)
     run.wait(120)
@@ -202,6 +204,7 @@ def test_a_closed_loop_run_and_its_result(bench: Connection, matrix: str) -> Non
     assert result.stable
 
 
+@pytest.mark.slow
 def test_a_halted_run_has_a_flat_mirror_and_continues(bench: Connection) -> None:
     run = bench.start("docrime", frames=4000)
     wait_for(lambda: bench.state.active_run is not None and bench.state.active_run.completed > 300, "frames")
@@ -276,6 +279,7 @@ def test_who_only_watches_writes_nothing_but_may_always_stop(served: Served, ben
         assert taken
 
 
+@pytest.mark.slow
 def test_the_page_on_the_server_can_be_followed(served: Served, bench: Connection) -> None:
     page = Path(__file__).parents[2] / "docs" / "server.md"
     block, *_ = re.findall(r"^```python\n(.*?)^```$", page.read_text(encoding="utf-8"), re.M | re.S)
@@ -294,6 +298,7 @@ def test_the_page_on_the_server_can_be_followed(served: Served, bench: Connectio
     wait_for(lambda: bench.state.mirror.peak == 0.0, "a flat mirror")
 
 
+@pytest.mark.slow
 def test_two_clients_race_for_the_lease_a_thousand_times(served: Served, bench: Connection) -> None:
     bench.release()
     with served.connect() as one, served.connect() as other:
@@ -321,6 +326,7 @@ def test_two_clients_race_for_the_lease_a_thousand_times(served: Served, bench: 
     assert sorted(won["one"] + won["other"]) == list(range(1000))
 
 
+@pytest.mark.slow
 def test_a_run_whose_holder_vanished_goes_on_and_control_is_free(system: Path, tmp_path: Path) -> None:
     with (
         serving(system, "--set", "server.lease_s=1.5", folder=tmp_path) as served,
@@ -342,6 +348,7 @@ def test_a_run_whose_holder_vanished_goes_on_and_control_is_free(system: Path, t
         assert watcher.state.fault is None
 
 
+@pytest.mark.slow
 def test_a_run_whose_holder_vanished_is_aborted_after_the_limit(system: Path, tmp_path: Path) -> None:
     limits = ("--set", "server.lease_s=1.5", "--set", "server.unattended_s=1")
     with serving(system, *limits, folder=tmp_path) as served, served.connect() as watcher:

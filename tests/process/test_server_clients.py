@@ -53,6 +53,7 @@ def memory(pid: int) -> int:
 
 
 @pytest.mark.parametrize("address", ["local", f"tcp://127.0.0.1:{PORT}"], ids=["local", "tcp"])
+@pytest.mark.slow
 def test_a_client_that_floods_and_never_reads_stops_nothing(
     served: Served, bench: Connection, address: str
 ) -> None:
@@ -90,6 +91,7 @@ def test_clients_that_leave_free_their_places(bench: Connection) -> None:
     assert bench.plan("docrime", {"frames": 500}).frames == 500
 
 
+@pytest.mark.slow
 def test_safety_requests_work_beyond_the_limit_and_silent_clients_lose_their_places(
     bench: Connection,
 ) -> None:
@@ -123,6 +125,7 @@ def test_safety_requests_work_beyond_the_limit_and_silent_clients_lose_their_pla
             assert wait_for(lambda: has_place(late), "a free place") < 30
 
 
+@pytest.mark.slow
 def test_a_client_of_another_computer_gets_the_log_of_a_restarted_server(
     system: Path, tmp_path: Path
 ) -> None:

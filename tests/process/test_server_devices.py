@@ -217,6 +217,7 @@ def test_a_closed_loop_converges_to_the_offset(bench: Connection, matrix: str) -
     assert share == pytest.approx(1.0, abs=0.35), "the mean shape of the loop has moved by the offset"
 
 
+@pytest.mark.slow
 def test_present_slopes_become_the_references(bench: Connection, matrix: str) -> None:
     assert bench.set_offsets(references="present").references
     assert bench.set_offsets(references="clear").references is False

@@ -59,6 +59,7 @@ def failsafe_of(served: Served) -> int:
     return int(found[0]) if found else 0
 
 
+@pytest.mark.slow
 def test_a_killed_fail_safe_process_is_restarted_and_works(system, bench, tmp_path) -> None:
     server, spy = bench
     with on_metal(system, server, tmp_path) as served, served.connect(control=True) as client:
@@ -101,6 +102,7 @@ def test_the_command_line_is_told_that_a_server_holds_the_hardware(
     unregister_server(listing)
 
 
+@pytest.mark.slow
 def test_a_front_that_was_killed_leaves_a_flat_mirror_and_a_note(system, bench, tmp_path) -> None:
     server, spy = bench
     # Longer than the path of a socket may be: the sockets are in a temporary folder.
@@ -140,6 +142,7 @@ def test_a_front_that_was_killed_leaves_a_flat_mirror_and_a_note(system, bench, 
         assert str(partial.parent) in notes
 
 
+@pytest.mark.slow
 def test_a_killed_supervisor_ends_the_server_with_a_flat_mirror(system, bench, tmp_path) -> None:
     server, spy = bench
     with on_metal(system, server, tmp_path) as served:

@@ -102,6 +102,7 @@ def made_safe(bench: Connection, spy: Spy, *words: str) -> None:
     assert bench.state.fault is None
 
 
+@pytest.mark.slow
 def test_a_matrix_of_stand_ins_serves_every_procedure_there(held) -> None:
     bench, _, matrix = held
     idle(bench)
@@ -147,6 +148,7 @@ def test_a_diverging_residual(closed, mirror, monkeypatch) -> None:
     made_safe(closed, mirror[1], "the residual grew")
 
 
+@pytest.mark.slow
 def test_a_poke_run_that_lost_its_lease(held, mirror) -> None:
     bench, watcher, _ = held
     idle(bench)

@@ -235,6 +235,7 @@ def escape_keys(home: Path, *words: str) -> dict:
     return json.loads(done.stdout)
 
 
+@pytest.mark.slow
 def test_with_keys_from_another_machine_and_nothing_without(
     system: Path, homes: tuple[Path, Path], tmp_path: Path
 ) -> None:

@@ -45,6 +45,7 @@ def _stand_in(monkeypatch):
     monkeypatch.setattr(campaign, "run_realisation", realisation)
 
 
+@pytest.mark.slow
 def test_a_killed_process_ends_the_campaign_and_finished_realisations_are_saved(tmp_path):
     curves = run(sky_time("razor-shwfs", realisations=8, frames=FRAMES, overrides=[str(tmp_path), "3"]))
     assert 1 <= curves["realisations"] <= 3
@@ -54,6 +55,7 @@ def test_a_killed_process_ends_the_campaign_and_finished_realisations_are_saved(
     assert curves["fewest_frames"]["whitened"] == 300
 
 
+@pytest.mark.slow
 def test_a_campaign_without_a_finished_realisation_is_an_error(tmp_path):
     with pytest.raises(CalibrationError, match="after 0 of 4 realisations; try fewer processes than 2"):
         run(sky_time("razor-shwfs", realisations=4, frames=FRAMES, overrides=[str(tmp_path), "0"]))
@@ -65,6 +67,7 @@ def test_a_campaign_without_accidents_has_no_note(tmp_path):
     assert "note" not in curves
 
 
+@pytest.mark.slow
 def test_when_stopped_it_saves_the_finished_realisations(tmp_path):
     stop = threading.Event()
 
@@ -82,12 +85,14 @@ def test_when_stopped_it_saves_the_finished_realisations(tmp_path):
     assert curves["note"] == f"stopped after {curves['realisations']} of 60 realisations"
 
 
+@pytest.mark.slow
 def test_an_error_in_a_realisation_is_raised(monkeypatch, tmp_path):
     monkeypatch.setattr(campaign, "run_realisation", fails)
     with pytest.raises(CalibrationError, match="no spots"):
         run(sky_time("razor-shwfs", realisations=2, frames=FRAMES, overrides=[str(tmp_path), "1"]))
 
 
+@pytest.mark.slow
 def test_every_device_is_simulated_whatever_the_file_says():
     config = load_system("razor-shwfs", mode="hardware", overrides=["devices.dm.mode=hardware"])
     twins = simulated_config(config, ["loop.gain=0.3"], seed=5)

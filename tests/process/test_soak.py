@@ -109,6 +109,7 @@ def soak(system: Path, folder: Path, warm_up_s: float, seconds: float, limit_byt
     assert shared[-1] <= shared[0]
 
 
+@pytest.mark.slow
 def test_nothing_grows_within_seconds(system: Path, tmp_path: Path) -> None:
     soak(system, tmp_path, warm_up_s=6, seconds=6, limit_bytes_per_s=500e3)
 

@@ -64,6 +64,7 @@ def test_a_pipe_without_a_reader_is_no_success(bare, words):
     assert done.stderr == (f"error: standard output cannot be written ({NO_READER})\n" if lost else "")
 
 
+@pytest.mark.slow
 def test_the_first_lines_of_a_long_table(bare, im):
     """As ``escape show FILE | head -1``, where the rest may have been written before the pipe was closed."""
     with subprocess.Popen(
@@ -115,6 +116,7 @@ def test_a_wrong_command_stays_one(bare, words, end):
 
 @pytest.mark.parametrize("bare", ["buffered"], indirect=True)
 @pytest.mark.parametrize("end", ["full", "pipe"])
+@pytest.mark.slow
 def test_a_run_whose_progress_is_not_read_is_finished(bare, system, tmp_path, end):
     """It takes long enough for many lines of progress."""
     nobody = without_reader() if end == "pipe" else os.open("/dev/full", os.O_WRONLY)
@@ -128,6 +130,7 @@ def test_a_run_whose_progress_is_not_read_is_finished(bare, system, tmp_path, en
 
 
 @pytest.mark.parametrize("bare", ["buffered"], indirect=True)
+@pytest.mark.slow
 def test_a_loop_whose_streams_share_a_pipe_without_a_reader_keeps_its_data(bare, system, im, tmp_path):
     """As ``escape loop ... 2>&1 | head -1``."""
     nobody = without_reader()
@@ -154,6 +157,7 @@ LOCALES = {
     [(("--help",), 0), (("doctor",), None), (("show", "n\N{LATIN SMALL LETTER O WITH DIAERESIS}"), 2)],
     ids=["help", "doctor", "path"],
 )  # fmt: skip
+@pytest.mark.slow
 def test_every_locale(bare, locale, words, code):
     environment = {**bare, **LOCALES[locale]}
     done = subprocess.run(

@@ -26,7 +26,7 @@ def at_most(size: int):
     return limit
 
 
-@pytest.mark.parametrize("method", ["docrime", "escape"])
+@pytest.mark.parametrize("method", ["docrime", pytest.param("escape", marks=pytest.mark.slow)])
 def test_no_room_for_the_matrix(escape, system, tmp_path, method):
     out = tmp_path / "run"
     words = ("calibrate", system, "--method", method, "--frames", 300, "--out", out, "--json")
@@ -42,6 +42,7 @@ def test_no_room_for_the_matrix(escape, system, tmp_path, method):
     assert "did not close cleanly" not in (out / "run.log").read_text()
 
 
+@pytest.mark.slow
 def test_no_room_after_the_matrix(escape, system, im, tmp_path):
     """The matrix fits, the report does not: the matrix is kept."""
     out = tmp_path / "run"

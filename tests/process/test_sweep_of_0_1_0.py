@@ -42,6 +42,7 @@ def loops(run: Path) -> dict[tuple[str, ...], dict[str, str]]:
         return {tuple(list(row.values())[:4]): row for row in csv.DictReader(table)}
 
 
+@pytest.mark.slow
 def test_a_finished_sweep_shows_its_result(runs):
     stored = json.loads((OLD / "sweep" / "result.json").read_text())
     shown = ended(start("--resume", str(runs / "sweep"), "--json", "--quiet"))
@@ -49,6 +50,7 @@ def test_a_finished_sweep_shows_its_result(runs):
     assert (runs / "sweep" / "report.html").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_a_finished_sweep_is_analysed_again(runs):
     """Without its result, the same conclusions are drawn from its trials."""
     stored, table = json.loads((OLD / "sweep" / "result.json").read_text()), loops(runs / "sweep")

@@ -28,6 +28,7 @@ def _compiled() -> None:
         pytest.skip(str(reason))
 
 
+@pytest.mark.slow
 def test_a_calibration_in_hardware_mode_on_the_simulated_bench(escape, system: Path, tmp_path: Path) -> None:
     calibrate = (
         "calibrate", system, "--mode", "hardware", "--set", REGION, "--frames", 50, "--quiet", "--json",
@@ -50,6 +51,7 @@ def test_the_commands_exit_code_is_passed_on(escape, system: Path) -> None:
     assert "error: no-such-command: No such file or directory" in missing.stderr
 
 
+@pytest.mark.slow
 def test_without_a_command_it_prints_the_environment_and_serves_until_stopped(
     environment, system: Path
 ) -> None:

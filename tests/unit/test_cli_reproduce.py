@@ -99,6 +99,7 @@ def test_reproduce_revolt_measures_all_matrices_with_one_geometry(escape, bench,
 
 
 @pytest.mark.usefixtures("empty_reports", "pictures")
+@pytest.mark.slow
 def test_reproduce_all_leads_to_every_report(escape, document, bench, tmp_path):
     words = ("reproduce", "all", "--out", tmp_path / "all", "--only", "maps", "--only", "table1")
     code, out, _ = escape(*words, "--share", 0.1)
@@ -142,6 +143,7 @@ def test_too_small_a_share_is_refused_before_anything_runs(document, bench, tmp_
 
 
 @pytest.mark.usefixtures("empty_reports")
+@pytest.mark.slow
 def test_reproduce_all_continues_where_it_was(document, bench, tmp_path):
     words = ("reproduce", "all", "--out", tmp_path / "all", "--share", 0.1)
     first = document(*words, "--only", "maps")[1]["parts"]["maps"]

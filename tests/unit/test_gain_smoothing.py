@@ -32,6 +32,7 @@ def test_errors_are_correct_with_and_without_deviations(scatter, noise):
     assert 0.2 < np.mean((best / best_sigma) ** 2) < 1.5
 
 
+@pytest.mark.slow
 def test_smoothing_improves_noisy_gains_and_does_not_degrade_others():
     *_, best, _, raw = trials(0.0, 0.15)
     assert best.std() < 0.4 * raw.std()

@@ -39,6 +39,7 @@ def test_ours_and_oopaos_sensor_give_the_same_matrix_and_ours_solves_it(alike, m
     assert (error < [0.01, 0.01, 1e-4, 3e-3, 3e-3]).all()
 
 
+@pytest.mark.slow
 def test_on_the_pyramid_both_solve_oopaos_matrix_and_ours_is_nearer():
     config = load_system("razor-pywfs", overrides=sprint._OOPAO_PYRAMID)
     model = make_fast_model(config, None)

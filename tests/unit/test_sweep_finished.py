@@ -56,6 +56,7 @@ def test_an_interrupted_run_is_not_finished(description: SweepDescription, tmp_p
 
 
 @pytest.mark.parametrize("where", ["run", "elsewhere"])
+@pytest.mark.slow
 def test_resume_of_a_finished_sweep_shows_its_result(
     escape, document, description, tmp_path, monkeypatch, where
 ):

@@ -92,6 +92,7 @@ def test_without_optuna_the_way_out_is_named(monkeypatch):
         require_optuna()
 
 
+@pytest.mark.slow
 def test_a_sweep_on_an_open_bench(tmp_path):
     with escape_hw.open_system("razor-shwfs", set=SMALL) as bench:
         path = escape_hw.save_matrix(tmp_path / "im.fits", bench.calibrate("push-pull"))

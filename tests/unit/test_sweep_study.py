@@ -194,6 +194,7 @@ def test_random_parameters_depend_on_the_realisation_only(opened):
     assert len({str(values) for values in by_realisation.values()}) == 5
 
 
+@pytest.mark.slow
 def test_tpe_learns_from_each_variant_alone(opened):
     one = opened(use_tpe=True)
 
