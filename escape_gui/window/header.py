@@ -291,6 +291,14 @@ class FrozenBanner(Banner):
         self.show_text(f"The panels show the data of {since}. The rows above are live." if since else "")
 
 
+class ServerBanner(Banner):
+    """Shows that the window is connected to a server while a recorded run is on screen."""
+
+    def __init__(self, context: Context) -> None:
+        super().__init__(context, Level.ACTIVE, "SERVER", QPushButton("Leave the replay"))
+        self.button.setToolTip("Close the recorded run and show the server.")
+
+
 class FaultBanner(Banner):
     """Shows a fault, with a button for the action that clears it."""
 
