@@ -54,7 +54,9 @@ class ModesPanel(Panel):
         self._live: dict[str, NDArray[np.float32]] = {}
         self._method = ""
         self._loaded = LoadedProducts()
-        self._running = self._user_selected = False
+        self._running = False
+        #: Label of the matrix that the user selected.
+        self._selected = ""
         self._run_id = -1
         self._make_controls()
         self._make_maps()
@@ -130,7 +132,7 @@ class ModesPanel(Panel):
         method = str(sample.meta.get("method") or sample.meta.get("stage", ""))
         self._method = METHOD_LABELS.get(method, method) or self._method
         if self._running and stream == "matrix":
-            self._user_selected = False
+            self._selected = ""
 
     def tick(self, source: DataSource) -> None:
         loaded = self.context.session.library.loaded
@@ -166,20 +168,20 @@ class ModesPanel(Panel):
         names = list(self.matrices)
         if names == [self.matrix_selector.itemData(k) for k in range(self.matrix_selector.count())]:
             return
-        current = self.matrix_selector.currentData()
         self.matrix_selector.clear()
         for name in names:
             self.matrix_selector.addItem(
                 f"{self._method}, {LIVE_LABEL}" if name == LIVE_LABEL and self._method else name, name
             )
         # Keep the user's choice, else the live matrix, else the newest.
-        if not (self._user_selected and current in names):
+        current = self._selected
+        if current not in names:
             current = LIVE_LABEL if LIVE_LABEL in names and self._running else (names[-1] if names else None)
         self.matrix_selector.setCurrentIndex(max(0, self.matrix_selector.findData(current)))
 
     # ------------------------------------------------------------ display
     def _choose_matrix(self) -> None:
-        self._user_selected = True
+        self._selected = str(self.matrix_selector.currentData())
         self._show_mosaic()
 
     def _show_mosaic(self) -> None:
@@ -238,7 +240,8 @@ class ModesPanel(Panel):
 
     def clear(self) -> None:
         self._live.clear()
-        self._user_selected = False
+        # The products of a source that goes on are shown again.
+        self._loaded = LoadedProducts()
         self.matrix_selector.clear()
         self.detail.hide()
 

@@ -29,6 +29,7 @@ from escape_gui.widgets.controls import Level
 from escape_gui.widgets.mode_maps import best_columns
 from escape_hw.api.registration import TO_STREAM_UNITS
 from escape_hw.io.documents import calibration_document
+from escape_hw.io.fits.gains import save_gains
 from escape_hw.io.fits.matrix import save_matrix
 from escape_hw.remote.state import (
     ActiveRun,
@@ -194,6 +195,34 @@ def test_a_click_shows_the_mode_in_every_matrix(calibrate, source, tmp_path):
     assert not panel.detail.isVisible()
     names = [array.name for array in panel.export_arrays()]
     assert names == ["matrix", "sigma"]
+
+
+def test_matrices_and_gains_are_listed_again_after_a_crash_of_the_engine(calibrate, source, tmp_path):
+    modes, gains = calibrate.panels["modes"], calibrate.panels["gains"]
+    products = []
+    for method in ("push-pull", "escape"):
+        made = fake.calibration(method, n=24, n_modes=30)
+        path = save_matrix(tmp_path / f"{method}.fits", made, fake.ORIGIN)
+        products.append(ProductEntry(name=method, kind="matrix", path=str(path)))
+    path = save_gains(tmp_path / "gains.fits", fake.gains_result(), "razor-shwfs", True, fake.ORIGIN)
+    products.append(ProductEntry(name="gains", kind="gains", path=str(path)))
+    source.change(products=tuple(products))
+    until(lambda: {"push-pull", "ESCAPE"} <= set(modes.matrices), calibrate)
+    until(lambda: bool(gains._curves), calibrate)
+    names, curves = list(modes.matrices), list(gains._curves)
+    modes.matrix_selector.setFocus()
+    QTest.keyClick(modes.matrix_selector, Qt.Key.Key_Home)
+    modes.matrix_selector.activated.emit(0)
+    source.fail("the engine died")
+    source.change(engine_pid=0)
+    look(calibrate)
+    source.change(engine_pid=12, phase=Phase.STARTING, fault=None)
+    look(calibrate)
+    assert [modes.matrix_selector.itemData(k) for k in range(modes.matrix_selector.count())] == names
+    assert modes.matrix_selector.currentData() == names[0]
+    assert not modes.shows_placeholder
+    assert list(gains._curves) == curves
+    assert not gains.shows_placeholder
 
 
 @pytest.mark.parametrize(
