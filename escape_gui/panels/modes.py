@@ -11,12 +11,20 @@ import numpy as np
 from numpy.typing import NDArray
 from PySide6.QtCore import Qt
 from PySide6.QtGui import QKeyEvent, QResizeEvent
-from PySide6.QtWidgets import QCheckBox, QComboBox, QLabel, QSizePolicy, QSplitter, QWidget
+from PySide6.QtWidgets import (
+    QCheckBox,
+    QGridLayout,
+    QLabel,
+    QSizePolicy,
+    QSplitter,
+    QWidget,
+)
 
 from escape_gui.client.product_library import LoadedProducts
 from escape_gui.panels.base import Context, ExportArray, Panel
 from escape_gui.views.mode_maps import LIMIT, tiles
 from escape_gui.widgets.controls import flat_button, row
+from escape_gui.widgets.inputs import NameSelector
 from escape_gui.widgets.mode_maps import DIVERGING, ColourScale, MapTiles, ModeMosaic, MosaicPixel
 from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.remote.source import DataSource, Sample
@@ -26,6 +34,8 @@ from escape_hw.report.tables import METHOD_LABELS
 #: Label of the matrix that is being measured.
 LIVE_LABEL = "live"
 _USAGE_TEXT = "Pairs: x slopes, y slopes. Click a mode to compare all matrices."
+#: Width of the selector of matrices beside its text, pixels.
+_SELECTOR_FRAME_PX = 40
 #: Maximum number of matrices in the detail of a mode.
 _MAX_MATRICES = 4
 #: Sizes of mosaic and detail, and the panel width from which they are side by side; pixels.
@@ -63,9 +73,10 @@ class ModesPanel(Panel):
 
     # ------------------------------------------------------------ construction
     def _make_controls(self) -> None:
-        self.matrix_selector = QComboBox()
+        self.matrix_selector = NameSelector()
         self.matrix_selector.setAccessibleName("Matrix shown")
-        self.matrix_selector.setSizeAdjustPolicy(QComboBox.SizeAdjustPolicy.AdjustToContents)
+        self.matrix_selector.setSizePolicy(QSizePolicy.Policy.Expanding, QSizePolicy.Policy.Fixed)
+        self.matrix_selector.currentTextChanged.connect(lambda _: self._arrange_controls())
         self.matrix_selector.activated.connect(self._choose_matrix)
         self.weight_by_snr = QCheckBox("Weight by SNR")
         self.weight_by_snr.setChecked(True)
@@ -80,7 +91,23 @@ class ModesPanel(Panel):
         self._page_label = QLabel()
         self._page_label.setToolTip("Page of the modes")
         self._page_controls = (self._previous_button, self._page_label, self._next_button)
-        self.body.addLayout(row(self.matrix_selector, self.weight_by_snr, None, *self._page_controls))
+        self._controls = QGridLayout()
+        self._controls.setHorizontalSpacing(8)
+        self._controls.setColumnStretch(0, 1)
+        self._controls.addWidget(self.matrix_selector, 0, 0)
+        self._controls.addLayout(row(*self._page_controls), 0, 2)
+        self.body.addLayout(self._controls)
+        self._arrange_controls()
+
+    def _arrange_controls(self) -> None:
+        """Put the check box into a line of its own where the name of the matrix would be cut."""
+        selector = self.matrix_selector
+        name = selector.fontMetrics().horizontalAdvance(selector.currentText())
+        frame = self.context.theme.pixels(_SELECTOR_FRAME_PX)
+        others = sum(one.sizeHint().width() for one in (self.weight_by_snr, *self._page_controls))
+        gaps = 4 * self._controls.horizontalSpacing() + 2 * self.body.contentsMargins().left()
+        fits = name + frame + others + gaps <= self.width()
+        self._controls.addWidget(self.weight_by_snr, *((0, 1) if fits else (1, 0)))
 
     def _make_maps(self) -> None:
         theme = self.context.theme
@@ -170,9 +197,8 @@ class ModesPanel(Panel):
             return
         self.matrix_selector.clear()
         for name in names:
-            self.matrix_selector.addItem(
-                f"{self._method}, {LIVE_LABEL}" if name == LIVE_LABEL and self._method else name, name
-            )
+            text = f"{self._method}, {LIVE_LABEL}" if name == LIVE_LABEL and self._method else name
+            self.matrix_selector.addItem(text, name)
         # Keep the user's choice, else the live matrix, else the newest.
         current = self._selected
         if current not in names:
@@ -221,6 +247,7 @@ class ModesPanel(Panel):
         self._page_label.setText(f"{page + 1} of {pages}")
         for widget in self._page_controls:
             widget.setVisible(pages > 1)
+        self._arrange_controls()
         self._previous_button.setEnabled(page > 0)
         self._next_button.setEnabled(page + 1 < pages)
 
@@ -232,6 +259,7 @@ class ModesPanel(Panel):
 
     def resizeEvent(self, event: QResizeEvent) -> None:
         super().resizeEvent(event)
+        self._arrange_controls()
         wide = self.width() >= self.context.theme.pixels(_SIDE_BY_SIDE_WIDTH)
         orientation = Qt.Orientation.Horizontal if wide else Qt.Orientation.Vertical
         if self.splitter.orientation() != orientation:

@@ -19,11 +19,8 @@ from PySide6.QtWidgets import (
 from escape_gui.views import procedure_form as form_text
 from escape_gui.views.convergence import short_unit
 from escape_gui.widgets.controls import caption, column, row, scroll_area
-from escape_gui.widgets.inputs import ignore_wheel_without_focus
+from escape_gui.widgets.inputs import LEAST_LETTERS, NameSelector
 from escape_hw.remote.state import Arguments, ProcedureParameter
-
-#: Letters of a field that are visible in a narrow window.
-_LEAST_LETTERS = 6
 
 
 class ArgumentForm(QWidget):
@@ -151,11 +148,7 @@ class ArgumentForm(QWidget):
             check.toggled.connect(edited)
             return check
         if one.kind in ("choice", "matrix"):
-            box = QComboBox()
-            ignore_wheel_without_focus(box)
-            # Names of matrices are long; they must not widen the form.
-            box.setSizeAdjustPolicy(QComboBox.SizeAdjustPolicy.AdjustToMinimumContentsLengthWithIcon)
-            box.setMinimumContentsLength(_LEAST_LETTERS)
+            box = NameSelector()
             box.addItems(
                 list(one.choices) if one.kind == "choice" else [form_text.NO_CHOICE, *self._matrices]
             )
@@ -167,7 +160,7 @@ class ArgumentForm(QWidget):
         line = QLineEdit(form_text.format_value(one.default))
         if one.default is None:
             line.setPlaceholderText("none")
-        line.setMinimumWidth(line.fontMetrics().horizontalAdvance("0" * _LEAST_LETTERS))
+        line.setMinimumWidth(line.fontMetrics().horizontalAdvance("0" * LEAST_LETTERS))
         line.textEdited.connect(edited)
         return line
 
