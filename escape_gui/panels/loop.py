@@ -85,6 +85,8 @@ class LoopPanel(Panel):
         self._matrices: list[str] = []
         #: Fields that do not follow the state, since the operator changed them.
         self._edited: set[str] = set()
+        #: Matrix that the operator chose, also while it is not listed, and the system of the edits.
+        self._chosen_matrix = self._system = ""
         self._checked_edit: LoopSettingsEdit | None = None
         self._message_colour = "text"
         self._build_layout()
@@ -158,14 +160,13 @@ class LoopPanel(Panel):
         self._follow_state()
 
     def _set_matrix_choices(self, summaries: dict[str, str]) -> None:
-        selected = self.matrix.currentText()
         self._matrices = list(summaries)
         self.matrix.clear()
         for k, (name, summary) in enumerate(summaries.items()):
             self.matrix.addItem(name)
             self.matrix.setItemData(k, summary, Qt.ItemDataRole.ToolTipRole)
-        if "matrix" in self._edited and selected in summaries:
-            self.matrix.setCurrentText(selected)
+        if "matrix" in self._edited and self._chosen_matrix in summaries:
+            self.matrix.setCurrentText(self._chosen_matrix)
         else:
             self.matrix.setCurrentIndex(len(summaries) - 1)  # the newest
 
@@ -199,6 +200,7 @@ class LoopPanel(Panel):
 
     def _on_edit(self, name: str) -> None:
         self._edited.add(name)
+        self._chosen_matrix = self.matrix.currentText() if name == "matrix" else self._chosen_matrix
         self._checked_edit = None
         errors = self.edit.validation_errors(self._loop)
         self._show_message("\n".join(errors) or "Edited; press Check.", errors=bool(errors))
@@ -218,8 +220,13 @@ class LoopPanel(Panel):
         for name in self.numbers.keys() - self._edited:
             self.numbers[name].setValue(getattr(loop, name))
 
+    def _forget_edits(self) -> None:
+        self._edited.clear()
+        self._checked_edit = None
+        self._show_message("")
+
     def _revert(self) -> None:
-        self.clear()
+        self._forget_edits()
         self._follow_state()
 
     def check(self) -> None:
@@ -260,7 +267,7 @@ class LoopPanel(Panel):
             self.context.session.ask(what, call, lambda _: self._on_done(done), self._on_refused)
 
     def _on_done(self, done: str) -> None:
-        self.clear()
+        self._forget_edits()
         self._show_message(done)
 
     def _on_refused(self, reason: str) -> None:
@@ -278,9 +285,16 @@ class LoopPanel(Panel):
         self.message.setStyleSheet(f"color: {self.context.theme.colour(self._message_colour).name()};")
 
     def clear(self) -> None:
-        self._edited.clear()
+        """Edited setpoints stay for the same system, after a crash of its engine or a reconnection.
+
+        They have to be checked again.
+        """
+        system = self.context.session.source.state.system
+        if system and system != self._system:
+            self._system = system
+            self._edited.clear()
         self._checked_edit = None
-        self._show_message("")
+        self._show_message("Edited before; press Check." if self._edited else "")
 
     def apply_theme(self) -> None:
         mono = self.context.theme.font(mono=True)
