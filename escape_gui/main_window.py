@@ -440,7 +440,7 @@ class MainWindow(QMainWindow):
             self.offsets_dialog.update_buttons()
         for dock in self.docks.values():
             dock.show_health()
-        self.state_notifier.update(state, connected=now.connected)
+        self.state_notifier.update(state, connected=now.connected, mine=now.may_write)
         self._note_layout()
         telemetry = state.recording
         self._set_status(

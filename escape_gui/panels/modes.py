@@ -192,18 +192,24 @@ class ModesPanel(Panel):
         return InteractionMatrix(data, sigma, unused, self._valid, "", self._method, True, slope_unit="1")
 
     def _update_selector(self) -> None:
-        names = list(self.matrices)
-        if names == [self.matrix_selector.itemData(k) for k in range(self.matrix_selector.count())]:
+        selector, names = self.matrix_selector, list(self.matrices)
+        entries = [(self._live_text if name == LIVE_LABEL else name, name) for name in names]
+        if entries == [(selector.itemText(k), selector.itemData(k)) for k in range(selector.count())]:
             return
-        self.matrix_selector.clear()
-        for name in names:
-            text = f"{self._method}, {LIVE_LABEL}" if name == LIVE_LABEL and self._method else name
-            self.matrix_selector.addItem(text, name)
+        selector.clear()
+        for text, name in entries:
+            selector.addItem(text, name)
         # Keep the user's choice, else the live matrix, else the newest.
         current = self._selected
         if current not in names:
             current = LIVE_LABEL if LIVE_LABEL in names and self._running else (names[-1] if names else None)
         self.matrix_selector.setCurrentIndex(max(0, self.matrix_selector.findData(current)))
+
+    @property
+    def _live_text(self) -> str:
+        """Words for the matrix of the streams, which is live only while it is measured."""
+        word = LIVE_LABEL if self._running else "as measured" if self.context.session.live else "recorded"
+        return f"{self._method}, {word}" if self._method else word
 
     # ------------------------------------------------------------ display
     def _choose_matrix(self) -> None:

@@ -74,6 +74,8 @@ class ProcedurePanel(Panel):
         self._state = State()
         self._ended: FinishedRun | None = None
         self._documents: dict[str, Mapping[str, Any]] = {}
+        #: System whose results are shown, and whether they are not those of a recorded run.
+        self._bench = ("", True)
         self._matrix: dict[str, NDArray[Any]] = {}
         self._make_form()
         self._make_buttons()
@@ -219,11 +221,15 @@ class ProcedurePanel(Panel):
         return self._ended.products.get(name, "") if self._ended is not None else ""
 
     def clear(self) -> None:
-        """Discard results; the form keeps what was entered, and is checked again."""
-        self._ended = self._requested_run = None
-        self._documents.clear()
+        """Discard the results of another bench; the form keeps what was entered, and is checked again."""
+        session = self.context.session
+        bench = (session.source.state.system, session.live)
+        if bench[0] and bench != self._bench:
+            self._bench, self._ended = bench, None
+            self._documents.clear()
+            self._result_area.hide()
+        self._requested_run = None
         self._matrix.clear()
-        self._result_area.hide()
         self._on_edit()
 
     # ------------------------------------------------------------ form

@@ -10,6 +10,7 @@ from PySide6.QtGui import QAction, QResizeEvent
 from PySide6.QtWidgets import QApplication, QHBoxLayout, QLabel, QPushButton, QSizePolicy, QWidget
 
 from escape_gui.client.availability import UNKNOWN_VALUE, has_engine, has_frames, is_measured
+from escape_gui.client.connection import CLIENT_NAME
 from escape_gui.panels.base import Context
 from escape_gui.widgets.controls import HoldButton, Level, Readout, StatusIndicator, column, row, text_label
 from escape_hw.io.provenance import format_local_time
@@ -177,7 +178,8 @@ class HeaderBar(QWidget):
         elif mine:
             self.control.set_status(Level.GOOD, "you have control")
         elif state.lease is not None:
-            self.control.set_status(Level.WARNING, f"{state.lease.name[:12]} has control")
+            name = "another window" if state.lease.name == CLIENT_NAME else state.lease.name[:12]
+            self.control.set_status(Level.WARNING, f"{name} has control")
         else:
             self.control.set_status(Level.NEUTRAL, "no operator connected")
 

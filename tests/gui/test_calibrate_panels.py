@@ -16,7 +16,7 @@ from PySide6.QtCore import QPoint, QRectF, Qt
 from PySide6.QtGui import QImage, QPainter
 from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QApplication, QPushButton
-from scripted import ScriptedControl, ScriptedSource
+from scripted import ScriptedControl, ScriptedSource, running
 
 from escape_gui.client.session import Session
 from escape_gui.main_window import MainWindow
@@ -144,6 +144,10 @@ def test_mode_maps_fill_in_while_they_are_measured(calibrate, source):
     assert contrast(panel) > 2 * pale
     panel.weight_by_snr.setChecked(False)
     assert contrast(panel) > 2 * pale
+    # Aborted without a product.
+    source.change(phase=Phase.IDLE, active_run=None)
+    look(calibrate)
+    assert panel.matrix_selector.currentText() == "DO-CRIME, as measured"
 
 
 def test_live_maps_belong_to_the_run_that_measures(calibrate, source):
@@ -454,6 +458,24 @@ def test_the_result_is_compared_with_the_previous_one(calibrate, source):
     look(calibrate)
     assert "(Δ 0.00 ± " in panel.numbers.text()
     assert panel.report.isVisible()
+
+
+def test_the_result_outlasts_the_engine_but_not_the_bench(calibrate, source, session, control):
+    panel = calibrate.panels["procedure"]
+    document = calibration_document(fake.calibration("escape"))
+    source.change(last_run=FinishedRun(id=2, name="escape", finish=Finish.DONE, document=document))
+    look(calibrate)
+    told = panel.numbers.text()
+    source.change(engine_pid=12, last_run=None)
+    look(calibrate)
+    assert panel._result_area.isVisible()
+    assert panel.numbers.text() == told
+    source.change(last_run=FinishedRun(id=3, name="escape", finish=Finish.DONE, document=document))
+    look(calibrate)
+    assert "Δ" in panel.numbers.text(), "the result of the engine before is compared"
+    session.set_source(ScriptedSource(running(system="maps-nir")), control)
+    look(calibrate)
+    assert not panel._result_area.isVisible()
 
 
 def test_new_matrices_are_offered_to_the_form(calibrate, source):
