@@ -200,7 +200,7 @@ class ModesPanel(Panel):
         for text, name in entries:
             selector.addItem(text, name)
         # Keep the user's choice, else the live matrix, else the newest.
-        current = self._selected
+        current: str | None = self._selected
         if current not in names:
             current = LIVE_LABEL if LIVE_LABEL in names and self._running else (names[-1] if names else None)
         self.matrix_selector.setCurrentIndex(max(0, self.matrix_selector.findData(current)))
