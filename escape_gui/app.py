@@ -23,6 +23,7 @@ from escape_gui.replay.playback import is_recording
 from escape_gui.replay.source import ReplaySource
 from escape_gui.settings import Settings, load_settings, settings_file
 from escape_gui.widgets.controls import Level
+from escape_gui.window.closing import is_busy
 from escape_gui.window.export import save_png
 from escape_hw.config.loader import load_system
 from escape_hw.errors import ConfigError
@@ -92,17 +93,31 @@ class WindowController(QObject):
         self.window, self.session = window, session
         self.local_server: LocalServer | None = None
         self._live: LiveSource | None = None
+        #: A recorded run on screen when the operator asked for a server, which then takes its place.
+        self._left_recording: ReplaySource | None = None
+        #: The window is connected, but a recorded run stays on screen.
+        self._waits = False
         self.attachment: ServerAttachment | None = None
         self._stopped: list[ServerAttachment] = []
         self._start_server = start_server
         window.connect_dialog.connect_requested.connect(self.connect_to)
         window.connect_dialog.start_requested.connect(self.start_server)
+        window.server_banner.button.clicked.connect(self._show_server)
         if address:
             self._attach(address, local_server)
 
     def connect_to(self, address: str, local_server: LocalServer | None = None) -> None:
-        """Disconnect from the present server, which goes on, and connect to another one."""
-        self.session.set_source(EmptySource(), None)
+        """Disconnect from the present server, which goes on, and connect to another one.
+
+        A recorded run stays on screen until the window is connected.
+        """
+        if self._waits and self.attachment is not None and address == self.attachment.address:
+            self._show_server()
+            return
+        self._left_recording = self._recording
+        if self._left_recording is None:
+            self.session.set_source(EmptySource(), None)
+        self._stop_waiting()
         if self.attachment is not None:
             # Its thread may wait for a reply; it is joined when the window is closed.
             self.attachment.stop()
@@ -128,25 +143,54 @@ class WindowController(QObject):
         if self.attachment is None or live is not self.attachment.live:
             return  # of the connection before
         old, self._live = self._live, live
-        self.session.set_source(live, live.connection)
         self.window.notifications.close_messages(_NO_SERVER)
-        self.window.connect_dialog.accept()
+        if self._recording is None or self._recording is self._left_recording:
+            self._show_server()
+        else:
+            # What the operator looks at is not taken away.
+            self._waits = True
+            address = self.attachment.address
+            self.window.server_banner.show_text(
+                f"Connected to {address}. The recorded run stays on screen until you leave it."
+            )
         if old is not None:
             self.attachment.discard(old)
+
+    @property
+    def _recording(self) -> ReplaySource | None:
+        """The recorded run on screen, if any."""
+        source = self.session.source
+        return source if isinstance(source, ReplaySource) else None
+
+    def _show_server(self) -> None:
+        """Show the server to which the window is connected, in the place of a recorded run."""
+        if self._live is None:
+            return
+        self._left_recording = None
+        self._stop_waiting()
+        self.session.set_source(self._live, self._live.connection)
+        self.window.connect_dialog.accept()
         if self.local_server is not None:
             self.window.take_control()
+
+    def _stop_waiting(self) -> None:
+        self._waits = False
+        self.window.server_banner.show_text("")
 
     def _connection_failed(self, reason: str) -> None:
         title = _NO_SERVER
         if self.local_server is not None:
             title, reason = "The server did not start", self.local_server.exit_message
         if reason:
+            self._stop_waiting()
             self.window.connect_dialog.show_error(reason)
             self.window.notifications.show_message(Level.ERROR, title, reason)
 
     def close(self) -> None:
         """Disconnect, and stop the local server unless it is left running. Close the session first."""
-        if self.local_server is not None and self.window.leave_server:
+        # Nobody was asked about a server that was never on screen.
+        unseen_and_busy = self._waits and self._live is not None and is_busy(self._live.state)
+        if self.local_server is not None and (self.window.leave_server or unseen_and_busy):
             self.local_server.leave()
         elif self.local_server is not None:
             self.local_server.terminate(None if self._live is None else self._live.connection)

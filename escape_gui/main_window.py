@@ -54,7 +54,14 @@ from escape_gui.window.docks import (
     workspace,
 )
 from escape_gui.window.export import Exporter
-from escape_gui.window.header import AlarmBanner, ControlBanner, FaultBanner, FrozenBanner, HeaderBar
+from escape_gui.window.header import (
+    AlarmBanner,
+    ControlBanner,
+    FaultBanner,
+    FrozenBanner,
+    HeaderBar,
+    ServerBanner,
+)
 from escape_gui.window.notifications import NotificationBar, StateNotifier
 from escape_gui.window.offsets_dialog import OffsetsDialog
 from escape_gui.window.recording_browser import RecordingBrowser
@@ -111,6 +118,7 @@ class MainWindow(QMainWindow):
         self.alarm_dialog.accepted.connect(self._save_settings)
         self.frozen_banner = FrozenBanner(self.context, self.actions_by_name["freeze"])
         self.control_banner = ControlBanner(self.context, self.actions_by_name["take_control"])
+        self.server_banner = ServerBanner(self.context)
         self.tabs = self._make_tabs()
         self.panels = {kind.name: kind(self.context) for kind in panels}
         self.docks = {name: self._make_dock(panel) for name, panel in self.panels.items()}
@@ -288,7 +296,9 @@ class MainWindow(QMainWindow):
         top = self._top = QWidget()
         top.setObjectName("header")
         top.setAttribute(Qt.WidgetAttribute.WA_StyledBackground)
-        banners = (self.fault_banner, self.alarm_banner, self.control_banner, self.frozen_banner)
+        banners = (
+            self.fault_banner, self.alarm_banner, self.control_banner, self.frozen_banner, self.server_banner,
+        )  # fmt: skip
         column(bar, self.header, *banners, parent=top, spacing=0)
         self.setMenuWidget(top)
 
@@ -430,7 +440,7 @@ class MainWindow(QMainWindow):
             self.offsets_dialog.update_buttons()
         for dock in self.docks.values():
             dock.show_health()
-        self.state_notifier.update(state, connected=now.connected)
+        self.state_notifier.update(state, connected=now.connected, mine=now.may_write)
         self._note_layout()
         telemetry = state.recording
         self._set_status(
@@ -513,6 +523,8 @@ class MainWindow(QMainWindow):
         other = MainWindow(Session(), self._settings.model_copy(deep=True), None, kinds)
         self.replay_windows.append(other)
         other.show_recording(source)
+        # It has no server, and needs none: this window stays on its own.
+        other.actions_by_name["connect"].setVisible(False)
         other.update_timer.start()
         # The bench stays visible beside the recorded run.
         other.resize(round(0.85 * self.width()), round(0.85 * self.height()))

@@ -101,6 +101,8 @@ class GainsPanel(Panel):
     def clear(self) -> None:
         self._live.clear()
         self._curves = {}
+        # The products of a source that goes on are shown again.
+        self._loaded = LoadedProducts()
 
     def apply_theme(self) -> None:
         self._update_legend()

@@ -7,15 +7,13 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from escape_gui.client.availability import UNKNOWN_VALUE
 from escape_gui.panels.base import Context, ExportArray, Panel
 from escape_gui.widgets.controls import Readout, readout_grid, row
-from escape_gui.widgets.plots import Plot
+from escape_gui.widgets.histogram_plot import HistogramPlot
 from escape_hw.remote.source import Sample
 from escape_hw.remote.state import State
-from escape_hw.streams.timing import MIDDLES, percentiles_of
-
-#: Percentiles at the ends of the axis; the largest value is shown as a number.
-_SHOWN_PERCENTILES = (0.0, 99.9)
+from escape_hw.streams.timing import MIDDLES
 
 
 class LatencyPanel(Panel):
@@ -42,38 +40,23 @@ class LatencyPanel(Panel):
             "jitter_p99": Readout(theme, "jitter p99", "µs", 6),
         }
         self.plots = (
-            Plot(theme, "Histogram of latencies", "latency [µs]", "frames"),
-            Plot(theme, "Histogram of frame intervals", "frame interval [µs]", "frames"),
+            HistogramPlot(theme, "Histogram of latencies", "latency [µs]", 0),
+            HistogramPlot(theme, "Histogram of frame intervals", "interval [µs]", 1),
         )
-        self._curves = []
-        for number, plot in enumerate(self.plots):
-            plot.setLogMode(x=False, y=True)
-            # Room for the upper half of the highest tick label.
-            plot.getPlotItem().layout.setContentsMargins(1, 8, 1, 1)
-            self._curves.append(plot.curve(number, alone=True, stepMode="center", connect="finite"))
         self.body.addLayout(readout_grid(self.readouts))
         self.body.addLayout(row(*((plot, 1) for plot in self.plots)), 1)
         self._counts: NDArray[Any] | None = None
 
     def on_state(self, state: State) -> None:
+        # Zero if no command was sent in the last second.
+        measured = state.latency.p99 > 0
         for name, readout in self.readouts.items():
-            value = getattr(state.latency, name)
-            readout.show_value(f"{value:.0f}" if np.isfinite(value) else "–")
+            readout.show_value(f"{getattr(state.latency, name):.0f}" if measured else UNKNOWN_VALUE)
 
     def on_sample(self, stream: str, sample: Sample) -> None:
         self._counts = sample.data
-        for plot, curve, counts in zip(self.plots, self._curves, sample.data, strict=True):
-            used = np.flatnonzero(counts)
-            if used.size == 0:
-                curve.setData([1.0, 2.0], [np.nan])
-                continue
-            first, last = max(int(used[0]) - 1, 1), min(int(used[-1]) + 2, MIDDLES.size - 1)
-            middles = MIDDLES[first - 1 : last + 1] / 1e3
-            edges = (middles[:-1] + middles[1:]) / 2
-            # 0.5 instead of zero, for the logarithmic axis.
-            curve.setData(edges, np.maximum(counts[first:last], 0.5))
-            low, high = percentiles_of(counts, _SHOWN_PERCENTILES) / 1e3
-            plot.setXRange(float(low) * 0.95, float(high) * 1.05)
+        for plot, counts in zip(self.plots, sample.data, strict=True):
+            plot.show_counts(counts)
 
     def clear(self) -> None:
         self._counts = None

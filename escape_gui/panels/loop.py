@@ -7,7 +7,7 @@ from functools import partial
 from typing import ClassVar
 
 from PySide6.QtCore import Qt
-from PySide6.QtWidgets import QComboBox, QGridLayout, QLabel, QPushButton, QWidget
+from PySide6.QtWidgets import QGridLayout, QLabel, QPushButton, QWidget
 
 from escape_gui.client.availability import (
     UNKNOWN_VALUE,
@@ -19,6 +19,7 @@ from escape_gui.client.availability import (
 from escape_gui.panels.base import Context, Panel
 from escape_gui.views.loop_form import FIELDS, LIMITS, LoopSettingsEdit
 from escape_gui.widgets.controls import (
+    ElidedLabel,
     HoldButton,
     Level,
     StatusIndicator,
@@ -27,7 +28,7 @@ from escape_gui.widgets.controls import (
     set_available,
     text_label,
 )
-from escape_gui.widgets.inputs import NumberBox, ignore_wheel_without_focus
+from escape_gui.widgets.inputs import NameSelector, NumberBox
 from escape_hw.remote.client import Connection
 from escape_hw.remote.source import DataSource
 from escape_hw.remote.state import LoopState, Phase, State
@@ -61,8 +62,7 @@ class LoopPanel(Panel):
         theme = context.theme
         self.loop_indicator = StatusIndicator(theme, "closed")
         self.modes = caption()
-        self.matrix = QComboBox()
-        ignore_wheel_without_focus(self.matrix)
+        self.matrix = NameSelector()
         self.load_button = QPushButton("Load…")
         self.load_button.setToolTip("Load the matrix of another run, also of an earlier night, or of a file")
         self.gain = NumberBox(*LIMITS["gain"], step=0.05, decimals=4)
@@ -70,7 +70,9 @@ class LoopPanel(Panel):
         self.dropped_modes = NumberBox(*LIMITS["dropped_modes"], step=1, decimals=0)
         self.numbers = {"gain": self.gain, "leak": self.leak, "dropped_modes": self.dropped_modes}
         self.editors: dict[str, QWidget] = {"matrix": self.matrix, **self.numbers}
-        self.current = {name: QLabel("–") for name in FIELDS}
+        #: Its name may be long.
+        self.current_matrix = ElidedLabel("–")
+        self.current = {name: QLabel("–") for name in self.numbers}
         self.check_button = QPushButton("Check")
         self.apply_button = QPushButton("Apply")
         self.revert_button = QPushButton("Revert")
@@ -83,6 +85,8 @@ class LoopPanel(Panel):
         self._matrices: list[str] = []
         #: Fields that do not follow the state, since the operator changed them.
         self._edited: set[str] = set()
+        #: Matrix that the operator chose, also while it is not listed, and the system of the edits.
+        self._chosen_matrix = self._system = ""
         self._checked_edit: LoopSettingsEdit | None = None
         self._message_colour = "text"
         self._build_layout()
@@ -101,7 +105,8 @@ class LoopPanel(Panel):
             form.addWidget(label, 2 * line, 0)
             # Names of matrices are long: their editor is in a line of its own.
             wide = name == "matrix"
-            form.addWidget(self.current[name], 2 * line, 1, 1, 2 if wide else 1)
+            current = self.current_matrix if wide else self.current[name]
+            form.addWidget(current, 2 * line, 1, 1, 2 if wide else 1)
             form.addWidget(self.editors[name], 2 * line + wide, 1 if wide else 2, 1, 2 if wide else 1)
             limits = f", {LIMITS[name][0]:g} to {LIMITS[name][1]:g}" if name in LIMITS else ""
             self.editors[name].setToolTip(f"{_TIPS[name]}{limits}")
@@ -142,12 +147,12 @@ class LoopPanel(Panel):
         )
         ended = has_ended(state)
         self.modes.setText(f"{loop.n_modes} modes controlled" if loop.n_modes and not ended else "")
+        # Without an engine nothing is in use.
+        self.current_matrix.show_text(UNKNOWN_VALUE if ended else loop.matrix or "none")
         values = {
-            "matrix": loop.matrix or "none", "gain": f"{loop.gain:.4f}", "leak": f"{loop.leak:.4f}",
-            "dropped_modes": str(loop.dropped_modes),
+            "gain": f"{loop.gain:.4f}", "leak": f"{loop.leak:.4f}", "dropped_modes": str(loop.dropped_modes),
         }  # fmt: skip
         for name, text in values.items():
-            # Without an engine nothing is in use.
             self.current[name].setText(UNKNOWN_VALUE if ended else text)
         summaries = {product.name: product.summary for product in state.products if product.kind == "matrix"}
         if list(summaries) != self._matrices:
@@ -155,14 +160,13 @@ class LoopPanel(Panel):
         self._follow_state()
 
     def _set_matrix_choices(self, summaries: dict[str, str]) -> None:
-        selected = self.matrix.currentText()
         self._matrices = list(summaries)
         self.matrix.clear()
         for k, (name, summary) in enumerate(summaries.items()):
             self.matrix.addItem(name)
             self.matrix.setItemData(k, summary, Qt.ItemDataRole.ToolTipRole)
-        if "matrix" in self._edited and selected in summaries:
-            self.matrix.setCurrentText(selected)
+        if "matrix" in self._edited and self._chosen_matrix in summaries:
+            self.matrix.setCurrentText(self._chosen_matrix)
         else:
             self.matrix.setCurrentIndex(len(summaries) - 1)  # the newest
 
@@ -196,6 +200,7 @@ class LoopPanel(Panel):
 
     def _on_edit(self, name: str) -> None:
         self._edited.add(name)
+        self._chosen_matrix = self.matrix.currentText() if name == "matrix" else self._chosen_matrix
         self._checked_edit = None
         errors = self.edit.validation_errors(self._loop)
         self._show_message("\n".join(errors) or "Edited; press Check.", errors=bool(errors))
@@ -215,8 +220,13 @@ class LoopPanel(Panel):
         for name in self.numbers.keys() - self._edited:
             self.numbers[name].setValue(getattr(loop, name))
 
+    def _forget_edits(self) -> None:
+        self._edited.clear()
+        self._checked_edit = None
+        self._show_message("")
+
     def _revert(self) -> None:
-        self.clear()
+        self._forget_edits()
         self._follow_state()
 
     def check(self) -> None:
@@ -257,7 +267,7 @@ class LoopPanel(Panel):
             self.context.session.ask(what, call, lambda _: self._on_done(done), self._on_refused)
 
     def _on_done(self, done: str) -> None:
-        self.clear()
+        self._forget_edits()
         self._show_message(done)
 
     def _on_refused(self, reason: str) -> None:
@@ -275,13 +285,20 @@ class LoopPanel(Panel):
         self.message.setStyleSheet(f"color: {self.context.theme.colour(self._message_colour).name()};")
 
     def clear(self) -> None:
-        self._edited.clear()
+        """Edited setpoints stay for the same system, after a crash of its engine or a reconnection.
+
+        They have to be checked again.
+        """
+        system = self.context.session.source.state.system
+        if system and system != self._system:
+            self._system = system
+            self._edited.clear()
         self._checked_edit = None
-        self._show_message("")
+        self._show_message("Edited before; press Check." if self._edited else "")
 
     def apply_theme(self) -> None:
         mono = self.context.theme.font(mono=True)
-        for label in self.current.values():
+        for label in (self.current_matrix, *self.current.values()):
             label.setFont(mono)
         for name, editor in self.editors.items():
             wide = name == "matrix"

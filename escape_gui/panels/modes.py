@@ -11,12 +11,20 @@ import numpy as np
 from numpy.typing import NDArray
 from PySide6.QtCore import Qt
 from PySide6.QtGui import QKeyEvent, QResizeEvent
-from PySide6.QtWidgets import QCheckBox, QComboBox, QLabel, QSizePolicy, QSplitter, QWidget
+from PySide6.QtWidgets import (
+    QCheckBox,
+    QGridLayout,
+    QLabel,
+    QSizePolicy,
+    QSplitter,
+    QWidget,
+)
 
 from escape_gui.client.product_library import LoadedProducts
 from escape_gui.panels.base import Context, ExportArray, Panel
 from escape_gui.views.mode_maps import LIMIT, tiles
 from escape_gui.widgets.controls import flat_button, row
+from escape_gui.widgets.inputs import NameSelector
 from escape_gui.widgets.mode_maps import DIVERGING, ColourScale, MapTiles, ModeMosaic, MosaicPixel
 from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.remote.source import DataSource, Sample
@@ -26,6 +34,8 @@ from escape_hw.report.tables import METHOD_LABELS
 #: Label of the matrix that is being measured.
 LIVE_LABEL = "live"
 _USAGE_TEXT = "Pairs: x slopes, y slopes. Click a mode to compare all matrices."
+#: Width of the selector of matrices beside its text, pixels.
+_SELECTOR_FRAME_PX = 40
 #: Maximum number of matrices in the detail of a mode.
 _MAX_MATRICES = 4
 #: Sizes of mosaic and detail, and the panel width from which they are side by side; pixels.
@@ -54,16 +64,19 @@ class ModesPanel(Panel):
         self._live: dict[str, NDArray[np.float32]] = {}
         self._method = ""
         self._loaded = LoadedProducts()
-        self._running = self._user_selected = False
+        self._running = False
+        #: Label of the matrix that the user selected.
+        self._selected = ""
         self._run_id = -1
         self._make_controls()
         self._make_maps()
 
     # ------------------------------------------------------------ construction
     def _make_controls(self) -> None:
-        self.matrix_selector = QComboBox()
+        self.matrix_selector = NameSelector()
         self.matrix_selector.setAccessibleName("Matrix shown")
-        self.matrix_selector.setSizeAdjustPolicy(QComboBox.SizeAdjustPolicy.AdjustToContents)
+        self.matrix_selector.setSizePolicy(QSizePolicy.Policy.Expanding, QSizePolicy.Policy.Fixed)
+        self.matrix_selector.currentTextChanged.connect(lambda _: self._arrange_controls())
         self.matrix_selector.activated.connect(self._choose_matrix)
         self.weight_by_snr = QCheckBox("Weight by SNR")
         self.weight_by_snr.setChecked(True)
@@ -78,7 +91,23 @@ class ModesPanel(Panel):
         self._page_label = QLabel()
         self._page_label.setToolTip("Page of the modes")
         self._page_controls = (self._previous_button, self._page_label, self._next_button)
-        self.body.addLayout(row(self.matrix_selector, self.weight_by_snr, None, *self._page_controls))
+        self._controls = QGridLayout()
+        self._controls.setHorizontalSpacing(8)
+        self._controls.setColumnStretch(0, 1)
+        self._controls.addWidget(self.matrix_selector, 0, 0)
+        self._controls.addLayout(row(*self._page_controls), 0, 2)
+        self.body.addLayout(self._controls)
+        self._arrange_controls()
+
+    def _arrange_controls(self) -> None:
+        """Put the check box into a line of its own where the name of the matrix would be cut."""
+        selector = self.matrix_selector
+        name = selector.fontMetrics().horizontalAdvance(selector.currentText())
+        frame = self.context.theme.pixels(_SELECTOR_FRAME_PX)
+        others = sum(one.sizeHint().width() for one in (self.weight_by_snr, *self._page_controls))
+        gaps = 4 * self._controls.horizontalSpacing() + 2 * self.body.contentsMargins().left()
+        fits = name + frame + others + gaps <= self.width()
+        self._controls.addWidget(self.weight_by_snr, *((0, 1) if fits else (1, 0)))
 
     def _make_maps(self) -> None:
         theme = self.context.theme
@@ -130,7 +159,7 @@ class ModesPanel(Panel):
         method = str(sample.meta.get("method") or sample.meta.get("stage", ""))
         self._method = METHOD_LABELS.get(method, method) or self._method
         if self._running and stream == "matrix":
-            self._user_selected = False
+            self._selected = ""
 
     def tick(self, source: DataSource) -> None:
         loaded = self.context.session.library.loaded
@@ -163,23 +192,28 @@ class ModesPanel(Panel):
         return InteractionMatrix(data, sigma, unused, self._valid, "", self._method, True, slope_unit="1")
 
     def _update_selector(self) -> None:
-        names = list(self.matrices)
-        if names == [self.matrix_selector.itemData(k) for k in range(self.matrix_selector.count())]:
+        selector, names = self.matrix_selector, list(self.matrices)
+        entries = [(self._live_text if name == LIVE_LABEL else name, name) for name in names]
+        if entries == [(selector.itemText(k), selector.itemData(k)) for k in range(selector.count())]:
             return
-        current = self.matrix_selector.currentData()
-        self.matrix_selector.clear()
-        for name in names:
-            self.matrix_selector.addItem(
-                f"{self._method}, {LIVE_LABEL}" if name == LIVE_LABEL and self._method else name, name
-            )
+        selector.clear()
+        for text, name in entries:
+            selector.addItem(text, name)
         # Keep the user's choice, else the live matrix, else the newest.
-        if not (self._user_selected and current in names):
+        current: str | None = self._selected
+        if current not in names:
             current = LIVE_LABEL if LIVE_LABEL in names and self._running else (names[-1] if names else None)
         self.matrix_selector.setCurrentIndex(max(0, self.matrix_selector.findData(current)))
 
+    @property
+    def _live_text(self) -> str:
+        """Words for the matrix of the streams, which is live only while it is measured."""
+        word = LIVE_LABEL if self._running else "as measured" if self.context.session.live else "recorded"
+        return f"{self._method}, {word}" if self._method else word
+
     # ------------------------------------------------------------ display
     def _choose_matrix(self) -> None:
-        self._user_selected = True
+        self._selected = str(self.matrix_selector.currentData())
         self._show_mosaic()
 
     def _show_mosaic(self) -> None:
@@ -219,6 +253,7 @@ class ModesPanel(Panel):
         self._page_label.setText(f"{page + 1} of {pages}")
         for widget in self._page_controls:
             widget.setVisible(pages > 1)
+        self._arrange_controls()
         self._previous_button.setEnabled(page > 0)
         self._next_button.setEnabled(page + 1 < pages)
 
@@ -230,6 +265,7 @@ class ModesPanel(Panel):
 
     def resizeEvent(self, event: QResizeEvent) -> None:
         super().resizeEvent(event)
+        self._arrange_controls()
         wide = self.width() >= self.context.theme.pixels(_SIDE_BY_SIDE_WIDTH)
         orientation = Qt.Orientation.Horizontal if wide else Qt.Orientation.Vertical
         if self.splitter.orientation() != orientation:
@@ -238,7 +274,8 @@ class ModesPanel(Panel):
 
     def clear(self) -> None:
         self._live.clear()
-        self._user_selected = False
+        # The products of a source that goes on are shown again.
+        self._loaded = LoadedProducts()
         self.matrix_selector.clear()
         self.detail.hide()
 

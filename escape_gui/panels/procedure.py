@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
 from numpy.typing import NDArray
-from PySide6.QtCore import QTimer, QUrl
+from PySide6.QtCore import QSignalBlocker, QTimer, QUrl
 from PySide6.QtGui import QDesktopServices, QResizeEvent
 from PySide6.QtWidgets import QComboBox, QGridLayout, QLabel, QProgressBar, QPushButton, QWidget
 
@@ -32,8 +32,9 @@ from escape_gui.widgets.controls import (
     text_label,
 )
 from escape_gui.widgets.inputs import ignore_wheel_without_focus
+from escape_hw.remote.run import RemoteRun
 from escape_hw.remote.source import DataSource, Sample
-from escape_hw.remote.state import Arguments, FinishedRun, ProcedureEntry, ProcedurePlan, State
+from escape_hw.remote.state import Arguments, FinishedRun, Phase, ProcedureEntry, ProcedurePlan, State
 from escape_hw.report.verdict import assess
 
 #: Delay between the last edit and the request for a plan.
@@ -57,13 +58,24 @@ class ProcedurePanel(Panel):
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)
+        #: Procedures that the present source offers, and those in the form.
+        self._offered: tuple[ProcedureEntry, ...] = ()
         self._entries: dict[str, ProcedureEntry] = {}
+        #: What the operator entered, by procedure and argument, and the procedure chosen last.
+        self._entered: dict[str, dict[str, str]] = {}
+        self._last_chosen = ""
+        #: The arguments have to be checked as soon as the engine can.
+        self._plan_is_due = False
+        #: Number of the requested run, 0 before the server's answer; ``None``: no request is pending.
+        self._requested_run: int | None = None
         self._plan: ProcedurePlan | None = None
         self._plan_level = "muted"
         self._checked_arguments: Arguments | None = None
         self._state = State()
         self._ended: FinishedRun | None = None
         self._documents: dict[str, Mapping[str, Any]] = {}
+        #: System whose results are shown, and whether they are not those of a recorded run.
+        self._bench = ("", True)
         self._matrix: dict[str, NDArray[Any]] = {}
         self._make_form()
         self._make_buttons()
@@ -71,7 +83,7 @@ class ProcedurePanel(Panel):
         self._timer = QTimer(self)
         self._timer.setSingleShot(True)
         self._timer.setInterval(_PLAN_DELAY_MS)
-        self._timer.timeout.connect(self.ask_plan)
+        self._timer.timeout.connect(self._ask_due_plan)
         self.setFocusProxy(self.choice)
         self.apply_theme()
 
@@ -134,18 +146,30 @@ class ProcedurePanel(Panel):
 
     # ------------------------------------------------------------ data
     def tick(self, source: DataSource) -> None:
-        if not self._entries and source.connected and (procedures := source.procedures()):
-            self._entries = {one.name: one for one in procedures}
-            for one in procedures:
-                self.choice.addItem(one.title, one.name)
-            self._on_procedure_selected()
-        self.form.setVisible(bool(self._entries))
-        if not self._entries:
-            replay = source.connected and self.context.session.control is None
-            _set_text(
-                self._description, REPLAY_TEXT if replay else "" if source.connected else NO_SERVER_TEXT
-            )
+        procedures = tuple(source.procedures())
+        if procedures != self._offered:
+            self._offered = procedures
+            if procedures and procedures != tuple(self._entries.values()):
+                self._show_procedures(procedures)
+        self.form.setVisible(bool(procedures))
+        self.choice.setVisible(bool(procedures))
+        if (text := self._describe(source)) != self._description.text():
+            _set_text(self._description, text)
+        if self._plan_is_due and not self._timer.isActive() and not self._reason_no_plan():
+            self._timer.start()
         self._enable()
+
+    def _show_procedures(self, procedures: Sequence[ProcedureEntry]) -> None:
+        """Offer other procedures; the one chosen last stays chosen if it is one of them."""
+        self._entries = {one.name: one for one in procedures}
+        blocker = QSignalBlocker(self.choice)
+        self.choice.clear()
+        for one in procedures:
+            self.choice.addItem(one.title, one.name)
+        self.choice.setCurrentIndex(max(0, self.choice.findData(self._last_chosen)))
+        self._last_chosen = self._last_chosen or self.chosen
+        blocker.unblock()
+        self._show_form()
 
     def on_state(self, state: State) -> None:
         self._state = state
@@ -197,11 +221,16 @@ class ProcedurePanel(Panel):
         return self._ended.products.get(name, "") if self._ended is not None else ""
 
     def clear(self) -> None:
-        self._entries, self._plan, self._ended = {}, None, None
-        self._documents.clear()
+        """Discard the results of another bench; the form keeps what was entered, and is checked again."""
+        session = self.context.session
+        bench = (session.source.state.system, session.live)
+        if bench[0] and bench != self._bench:
+            self._bench, self._ended = bench, None
+            self._documents.clear()
+            self._result_area.hide()
+        self._requested_run = None
         self._matrix.clear()
-        self.choice.clear()
-        self._result_area.hide()
+        self._on_edit()
 
     # ------------------------------------------------------------ form
     @property
@@ -209,17 +238,43 @@ class ProcedurePanel(Panel):
         return str(self.choice.currentData() or "")
 
     def _on_procedure_selected(self) -> None:
+        self._last_chosen = self.chosen
+        self._show_form()
+
+    def _show_form(self) -> None:
         entry = self._entries.get(self.chosen)
-        _set_text(self._description, entry.help if entry else "")
-        self.form.show_parameters(entry.parameters if entry else (), form_text.matrices(self._state.products))
+        self.form.show_parameters(
+            entry.parameters if entry else (),
+            form_text.matrices(self._state.products),
+            self._entered.setdefault(self.chosen, {}),
+        )
         self._on_edit()
 
+    def _describe(self, source: DataSource) -> str:
+        """Help of the procedure and what is not valid on this server, or why there is no procedure."""
+        if self._offered:
+            entry = self._entries.get(self.chosen)
+            parts = ("" if entry is None else entry.help, form_text.rejected_line(self.form.rejected))
+            return "\n".join(part for part in parts if part)
+        if not source.connected:
+            return NO_SERVER_TEXT
+        return REPLAY_TEXT if self.context.session.control is None else ""
+
     def _on_edit(self) -> None:
-        self._plan = None
+        self._plan = self._checked_arguments = None
         self._show_plan("")
         self._enable()
-        if self.chosen and self.context.session.control is not None:
+        self._plan_is_due = True
+        # Once more after every edit.
+        self._timer.stop()
+        if self.chosen and not self._reason_no_plan():
             self._timer.start()
+
+    def _reason_no_plan(self) -> str:
+        """Why the arguments cannot be checked."""
+        now = self.context.session.request_context
+        starting = "the engine is starting" if now.state.phase is Phase.STARTING else ""
+        return reason_no_engine(now) or starting or ("" if self._offered else "no procedures yet")
 
     def _show_plan(self, text: str, level: str = "muted") -> None:
         _set_text(self.plan, text)
@@ -233,9 +288,14 @@ class ProcedurePanel(Panel):
         self.verdict.setStyleSheet(f"color: {self.context.theme.colour(self._verdict_level.value).name()};")
 
     # ------------------------------------------------------------ requests
+    def _ask_due_plan(self) -> None:
+        if not self._reason_no_plan():
+            self.ask_plan()
+
     def ask_plan(self) -> None:
         """Request the plan for the arguments in the form; nothing moves."""
         session, name = self.context.session, self.chosen
+        self._plan_is_due = False
         if session.control is None or not name:
             return
         try:
@@ -266,12 +326,35 @@ class ProcedurePanel(Panel):
         if session.control is not None and self._plan is not None and arguments is not None:
             # A disabled button passes its focus on to the next widget, whatever it is.
             self.choice.setFocus()
-            self.start.setEnabled(False)
-            session.ask(f"start {self.choice.currentText()}", lambda server: server.start(name, **arguments))
+            self._requested_run = 0
+            session.ask(
+                f"start {self.choice.currentText()}",
+                lambda server: server.start(name, **arguments),
+                self._on_started,
+                lambda _: self._on_start_failed(),
+            )
+            self._enable()
+
+    def _on_started(self, run: RemoteRun) -> None:
+        self._requested_run = run.id
+        self._enable()
+
+    def _on_start_failed(self) -> None:
+        self._requested_run = None
+        self._enable()
+
+    def _start_is_pending(self, state: State) -> bool:
+        """Whether neither the server's answer nor a state with the requested run has arrived."""
+        if self._requested_run:
+            newest = max((one.id for one in (state.active_run, state.last_run) if one is not None), default=0)
+            if newest >= self._requested_run:
+                self._requested_run = None
+        return self._requested_run is not None
 
     def _enable(self) -> None:
         now = self.context.session.request_context
         busy = "a procedure is running" if now.state.active_run is not None else ""
+        busy = busy or ("it is being started" if self._start_is_pending(now.state) else "")
         not_checked = "" if self._plan is not None else "the arguments are not checked yet"
         for button, tip, reason in (
             (self.check, "Check the arguments and show the plan; nothing moves.", reason_no_engine(now)),

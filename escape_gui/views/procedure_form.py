@@ -89,6 +89,21 @@ def parse_value(parameter: ProcedureParameter, text: str) -> float | int | str |
     return int(number)
 
 
+def is_valid(parameter: ProcedureParameter, text: str) -> bool:
+    """Whether a field may have this text."""
+    try:
+        parse_value(parameter, text)
+    except ValueError:
+        return False
+    return True
+
+
+def rejected_line(rejected: Mapping[str, str]) -> str:
+    """A line on entered values that are not valid on this server, by label; empty if there is none."""
+    parts = ", ".join(f"{name} {text}" for name, text in rejected.items())
+    return f"Entered before, but not valid here: {parts}." if parts else ""
+
+
 def matrices(products: tuple[ProductEntry, ...]) -> tuple[str, ...]:
     """Names of the matrices to choose from, the newest first."""
     return tuple(one.name for one in reversed(products) if one.kind == "matrix")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 
-from PySide6.QtCore import QSize, Qt, Signal
+from PySide6.QtCore import QSignalBlocker, QSize, Qt, Signal
 from PySide6.QtWidgets import (
     QCheckBox,
     QComboBox,
@@ -19,11 +19,8 @@ from PySide6.QtWidgets import (
 from escape_gui.views import procedure_form as form_text
 from escape_gui.views.convergence import short_unit
 from escape_gui.widgets.controls import caption, column, row, scroll_area
-from escape_gui.widgets.inputs import ignore_wheel_without_focus
+from escape_gui.widgets.inputs import LEAST_LETTERS, NameSelector
 from escape_hw.remote.state import Arguments, ProcedureParameter
-
-#: Letters of a field that are visible in a narrow window.
-_LEAST_LETTERS = 6
 
 
 class ArgumentForm(QWidget):
@@ -39,6 +36,8 @@ class ArgumentForm(QWidget):
         self._parameters: tuple[ProcedureParameter, ...] = ()
         self.fields: dict[str, QWidget] = {}
         self._matrices: tuple[str, ...] = ()
+        #: Texts of the fields that the operator changed, by the name of the argument.
+        self._entered: dict[str, str] = {}
         self._area = scroll_area()
         # The Tab key goes to the fields.
         self._area.setFocusPolicy(Qt.FocusPolicy.NoFocus)
@@ -51,9 +50,22 @@ class ArgumentForm(QWidget):
         hint, page = super().sizeHint(), self._area.widget()
         return hint if page is None else QSize(hint.width(), page.sizeHint().height())
 
-    def show_parameters(self, parameters: Sequence[ProcedureParameter], matrices: tuple[str, ...]) -> None:
-        """Build the form, with the default values."""
-        self._parameters, self._matrices = tuple(parameters), matrices
+    def show_parameters(
+        self, parameters: Sequence[ProcedureParameter], matrices: tuple[str, ...], entered: dict[str, str]
+    ) -> None:
+        """Build the form, with the entered texts where they are valid, else with the default values.
+
+        Parameters
+        ----------
+        parameters
+            Declarations of the arguments.
+        matrices
+            Names of the matrices to choose from.
+        entered
+            Texts entered before, by the name of the argument; texts that are entered later are added. A text
+            that is not valid here stays in it, for a server on which it is.
+        """
+        self._parameters, self._matrices, self._entered = tuple(parameters), matrices, entered
         self.fields = {}
         page = QWidget()
         form = QFormLayout(page)
@@ -76,6 +88,32 @@ class ArgumentForm(QWidget):
         for before, after in itertools.pairwise((self._previous, *self.fields.values())):
             QWidget.setTabOrder(before, after)
         self.updateGeometry()
+        for one in self._parameters:
+            self._restore(one)
+
+    def _restore(self, one: ProcedureParameter) -> None:
+        """Show what was entered for an argument, if it is valid."""
+        text, field = self._entered.get(one.name), self.fields[one.name]
+        if text is None:
+            return
+        blocker = QSignalBlocker(field)
+        if isinstance(field, QCheckBox):
+            field.setChecked(text == str(True))
+        elif isinstance(field, QComboBox):
+            # A text that is none of the choices changes nothing.
+            field.setCurrentText(text)
+        elif isinstance(field, QLineEdit) and form_text.is_valid(one, text):
+            field.setText(text)
+        blocker.unblock()
+
+    @property
+    def rejected(self) -> dict[str, str]:
+        """Entered texts that are not shown, since they are not valid here, by the label of the argument."""
+        return {
+            form_text.label(one): self._entered[one.name]
+            for one in self._parameters
+            if one.name in self._entered and self._entered[one.name] != _text(self.fields[one.name])
+        }
 
     def set_matrix_choices(self, matrices: tuple[str, ...]) -> None:
         """Replace the matrices to choose from; a choice that still exists is kept."""
@@ -93,36 +131,37 @@ class ArgumentForm(QWidget):
                 wanted = now if now in matrices and not first else self._default_matrix(one)
                 field.setCurrentText(wanted)
                 field.blockSignals(False)
+                self._restore(one)
         self.edited.emit()
 
     def _default_matrix(self, parameter: ProcedureParameter) -> str:
         return self._matrices[0] if parameter.name == "im" and self._matrices else form_text.NO_CHOICE
 
     def _make_field(self, one: ProcedureParameter) -> QWidget:
+        def edited(*_: object) -> None:
+            self._entered[one.name] = _text(self.fields[one.name])
+            self.edited.emit()
+
         if one.kind == "bool":
             check = QCheckBox()
             check.setChecked(bool(one.default))
-            check.toggled.connect(self.edited)
+            check.toggled.connect(edited)
             return check
         if one.kind in ("choice", "matrix"):
-            box = QComboBox()
-            ignore_wheel_without_focus(box)
-            # Names of matrices are long; they must not widen the form.
-            box.setSizeAdjustPolicy(QComboBox.SizeAdjustPolicy.AdjustToMinimumContentsLengthWithIcon)
-            box.setMinimumContentsLength(_LEAST_LETTERS)
+            box = NameSelector()
             box.addItems(
                 list(one.choices) if one.kind == "choice" else [form_text.NO_CHOICE, *self._matrices]
             )
             box.setCurrentText(
                 form_text.format_value(one.default) if one.kind == "choice" else self._default_matrix(one)
             )
-            box.currentIndexChanged.connect(self.edited)
+            box.currentIndexChanged.connect(edited)
             return box
         line = QLineEdit(form_text.format_value(one.default))
         if one.default is None:
             line.setPlaceholderText("none")
-        line.setMinimumWidth(line.fontMetrics().horizontalAdvance("0" * _LEAST_LETTERS))
-        line.textEdited.connect(self.edited)
+        line.setMinimumWidth(line.fontMetrics().horizontalAdvance("0" * LEAST_LETTERS))
+        line.textEdited.connect(edited)
         return line
 
     def arguments(self) -> Arguments:
@@ -133,10 +172,14 @@ class ArgumentForm(QWidget):
             if isinstance(field, QCheckBox):
                 values[one.name] = field.isChecked()
             else:
-                text = field.currentText() if isinstance(field, QComboBox) else _text(field)
-                values[one.name] = form_text.parse_value(one, text)
+                values[one.name] = form_text.parse_value(one, _text(field))
         return form_text.non_default_arguments(self._parameters, values)
 
 
 def _text(field: QWidget) -> str:
+    """Content of a field; ``True`` or ``False`` for a check box."""
+    if isinstance(field, QCheckBox):
+        return str(field.isChecked())
+    if isinstance(field, QComboBox):
+        return field.currentText()
     return field.text() if isinstance(field, QLineEdit) else ""

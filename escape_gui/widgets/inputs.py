@@ -3,11 +3,22 @@
 from __future__ import annotations
 
 from PySide6.QtCore import QEvent, QLocale, QObject, Qt, Signal
-from PySide6.QtGui import QValidator
-from PySide6.QtWidgets import QAbstractSpinBox, QDoubleSpinBox, QWidget
+from PySide6.QtGui import QHelpEvent, QPaintEvent, QValidator
+from PySide6.QtWidgets import (
+    QAbstractSpinBox,
+    QComboBox,
+    QDoubleSpinBox,
+    QStyle,
+    QStyleOptionComboBox,
+    QStylePainter,
+    QToolTip,
+    QWidget,
+)
 
 #: Range in which a number can be typed, so that a value out of its limits can be reported.
 _TYPED_RANGE = 1e6
+#: Letters of a field that are visible in a narrow window, and room beside the text of a choice, pixels.
+LEAST_LETTERS, _TEXT_MARGIN_PX = 6, 8
 
 
 class _WheelFilter(QObject):
@@ -74,3 +85,45 @@ class NumberBox(QDoubleSpinBox):
         if self.value() < self.high:
             flags |= QAbstractSpinBox.StepEnabledFlag.StepUpEnabled
         return flags
+
+
+class NameSelector(QComboBox):
+    """A choice of long names, such as those of matrices, that does not widen its panel.
+
+    A name that does not fit is elided in its middle, since names often differ at the end; the list and the
+    tooltip have the whole names.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.setMinimumContentsLength(LEAST_LETTERS)
+        self.setSizeAdjustPolicy(QComboBox.SizeAdjustPolicy.AdjustToMinimumContentsLengthWithIcon)
+        ignore_wheel_without_focus(self)
+
+    @property
+    def shown_text(self) -> str:
+        """The name as it is drawn."""
+        option = QStyleOptionComboBox()
+        self.initStyleOption(option)
+        place = self.style().subControlRect(
+            QStyle.ComplexControl.CC_ComboBox, option, QStyle.SubControl.SC_ComboBoxEditField, self
+        )
+        middle = Qt.TextElideMode.ElideMiddle
+        return self.fontMetrics().elidedText(self.currentText(), middle, place.width() - _TEXT_MARGIN_PX)
+
+    def paintEvent(self, event: QPaintEvent) -> None:
+        painter, option = QStylePainter(self), QStyleOptionComboBox()
+        self.initStyleOption(option)
+        option.currentText = self.shown_text
+        painter.drawComplexControl(QStyle.ComplexControl.CC_ComboBox, option)
+        painter.drawControl(QStyle.ControlElement.CE_ComboBoxLabel, option)
+
+    def showPopup(self) -> None:
+        self.view().setMinimumWidth(self.view().sizeHintForColumn(0) + 2 * _TEXT_MARGIN_PX)
+        super().showPopup()
+
+    def event(self, event: QEvent) -> bool:
+        if isinstance(event, QHelpEvent) and self.shown_text != self.currentText():
+            QToolTip.showText(event.globalPos(), f"{self.currentText()}\n{self.toolTip()}".strip(), self)
+            return True
+        return super().event(event)

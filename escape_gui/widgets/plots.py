@@ -43,8 +43,9 @@ class Plot(pg.PlotWidget):  # type: ignore[misc]
     It has no grid, which takes ten times as long to draw as the curves.
     """
 
-    def __init__(self, theme: Theme, name: str, x: str, y: str) -> None:
-        super().__init__(axisItems={"bottom": SparseAxis("bottom")})
+    def __init__(self, theme: Theme, name: str, x: str, y: str, left: pg.AxisItem | None = None) -> None:
+        """``left``: another axis than the usual one."""
+        super().__init__(axisItems={"bottom": SparseAxis("bottom"), "left": left or pg.AxisItem("left")})
         self._theme, self._labels = theme, {"bottom": x, "left": y}
         self._curves: list[tuple[Any, int, bool]] = []
         self.setAccessibleName(name)
@@ -172,7 +173,8 @@ class SparseAxis(pg.AxisItem):  # type: ignore[misc]
         else:
             texts = self.tickStrings(values, self.autoSIPrefixScale * self.scale, spacing)
             room = max(map(metrics.horizontalAdvance, (*texts, ""))) + metrics.averageCharWidth()
-        step = max(1, math.ceil(len(values) * room / max(size, room)))
+        gap = size * (values[1] - values[0]) / (high - low) if len(values) > 1 and high > low else room
+        step = max(1, math.ceil(room / gap))
         return [(spacing, list(values[::step])), *(others if step == 1 else ())]
 
 

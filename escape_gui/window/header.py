@@ -10,6 +10,7 @@ from PySide6.QtGui import QAction, QResizeEvent
 from PySide6.QtWidgets import QApplication, QHBoxLayout, QLabel, QPushButton, QSizePolicy, QWidget
 
 from escape_gui.client.availability import UNKNOWN_VALUE, has_engine, has_frames, is_measured
+from escape_gui.client.connection import CLIENT_NAME
 from escape_gui.panels.base import Context
 from escape_gui.widgets.controls import HoldButton, Level, Readout, StatusIndicator, column, row, text_label
 from escape_hw.io.provenance import format_local_time
@@ -177,7 +178,8 @@ class HeaderBar(QWidget):
         elif mine:
             self.control.set_status(Level.GOOD, "you have control")
         elif state.lease is not None:
-            self.control.set_status(Level.WARNING, f"{state.lease.name[:12]} has control")
+            name = "another window" if state.lease.name == CLIENT_NAME else state.lease.name[:12]
+            self.control.set_status(Level.WARNING, f"{name} has control")
         else:
             self.control.set_status(Level.NEUTRAL, "no operator connected")
 
@@ -289,6 +291,14 @@ class FrozenBanner(Banner):
     def show_frozen(self, since: str) -> None:
         """Show the time since when the panels are frozen; empty: they are not."""
         self.show_text(f"The panels show the data of {since}. The rows above are live." if since else "")
+
+
+class ServerBanner(Banner):
+    """Shows that the window is connected to a server while a recorded run is on screen."""
+
+    def __init__(self, context: Context) -> None:
+        super().__init__(context, Level.ACTIVE, "SERVER", QPushButton("Leave the replay"))
+        self.button.setToolTip("Close the recorded run and show the server.")
 
 
 class FaultBanner(Banner):

@@ -9,7 +9,7 @@ from PySide6.QtWidgets import QFrame, QLabel, QSizePolicy, QWidget
 from escape_gui.theme import Theme
 from escape_gui.views.procedure_form import comparison_lines
 from escape_gui.widgets.controls import QUALITY_LEVELS, Level, StatusIndicator, caption, flat_button, row
-from escape_hw.remote.state import Finish, State
+from escape_hw.remote.state import Finish, Lease, State
 from escape_hw.report.verdict import assess
 
 #: Display time of a notification; errors stay until they are closed.
@@ -94,8 +94,18 @@ class NotificationBar(QWidget):
 
 
 #: Titles of notifications that are closed when their reason has passed.
-_LOST, _FAULT = "Server lost", "Fault, mirror made safe"
+_LOST, _FAULT, _TAKEN = "Server lost", "Fault, mirror made safe", "Control taken"
 _LEVELS = {Finish.DONE: Level.GOOD, Finish.ABORTED: Level.WARNING, Finish.FAILED: Level.ERROR}
+
+
+def _was_taken(before: Lease | None, now: Lease | None) -> bool:
+    """Whether another client has control; after a reconnection, the holder is the same for a while."""
+    return before is not None and now is not None and now.client != before.client
+
+
+def _describe_taker(lease: Lease | None) -> str:
+    taker = "" if lease is None else f"{lease.name} on {lease.host} (process {lease.pid})"
+    return f"{taker} has taken control; this window only shows. Ctrl+L takes it back."
 
 
 class StateNotifier:
@@ -104,18 +114,25 @@ class StateNotifier:
     def __init__(self, bar: NotificationBar) -> None:
         self._bar = bar
         self._state: State | None = None
-        self._connected = False
+        self._connected = self._mine = False
 
-    def update(self, state: State, *, connected: bool) -> None:
-        """Report a lost server, start-up notices, a fault, and the end of a procedure."""
-        before, was_connected = self._state, self._connected
-        self._state, self._connected = state, connected
+    def update(self, state: State, *, connected: bool, mine: bool) -> None:
+        """Report a lost server, start-up notices, loss of control, a fault, and the end of a procedure.
+
+        ``mine``: this window has control.
+        """
+        before, was_connected, was_mine = self._state, self._connected, self._mine
+        self._state, self._connected, self._mine = state, connected, mine
         if was_connected and not connected:
             why = "Connection lost; reconnecting automatically."
             self._bar.show_message(Level.ERROR, _LOST, why)
         if not connected:
             return
         self._bar.close_messages(_LOST)
+        if mine:
+            self._bar.close_messages(_TAKEN)
+        elif was_mine and before is not None and _was_taken(before.lease, state.lease):
+            self._bar.show_message(Level.ERROR, _TAKEN, _describe_taker(state.lease))
         if state.fault is None:
             self._bar.close_messages(_FAULT)
         # A front end that was restarted may have been away for less than what counts as disconnected.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -339,6 +340,14 @@ class ScriptedControl:
             description=f"{kind} {number + 1} at {amplitude:+g} of the stroke (+150 nm of surface)",
             peak=abs(amplitude), peak_nm=150.0, allowed=0.4, refusal=self.refusal,
         )  # fmt: skip
+
+    #: Number of the next run.
+    next_run = 3
+
+    def start(self, procedure: str, **arguments: Any) -> SimpleNamespace:
+        """A run of a procedure."""
+        self._note("start", args=(procedure,), **arguments)
+        return SimpleNamespace(id=self.next_run)
 
     def plan(self, procedure: str, arguments: Arguments) -> ProcedurePlan:
         """A plan."""

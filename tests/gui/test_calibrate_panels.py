@@ -16,7 +16,7 @@ from PySide6.QtCore import QPoint, QRectF, Qt
 from PySide6.QtGui import QImage, QPainter
 from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QApplication, QPushButton
-from scripted import ScriptedControl, ScriptedSource
+from scripted import ScriptedControl, ScriptedSource, running
 
 from escape_gui.client.session import Session
 from escape_gui.main_window import MainWindow
@@ -29,6 +29,7 @@ from escape_gui.widgets.controls import Level
 from escape_gui.widgets.mode_maps import best_columns
 from escape_hw.api.registration import TO_STREAM_UNITS
 from escape_hw.io.documents import calibration_document
+from escape_hw.io.fits.gains import save_gains
 from escape_hw.io.fits.matrix import save_matrix
 from escape_hw.remote.state import (
     ActiveRun,
@@ -143,6 +144,10 @@ def test_mode_maps_fill_in_while_they_are_measured(calibrate, source):
     assert contrast(panel) > 2 * pale
     panel.weight_by_snr.setChecked(False)
     assert contrast(panel) > 2 * pale
+    # Aborted without a product.
+    source.change(phase=Phase.IDLE, active_run=None)
+    look(calibrate)
+    assert panel.matrix_selector.currentText() == "DO-CRIME, as measured"
 
 
 def test_live_maps_belong_to_the_run_that_measures(calibrate, source):
@@ -194,6 +199,34 @@ def test_a_click_shows_the_mode_in_every_matrix(calibrate, source, tmp_path):
     assert not panel.detail.isVisible()
     names = [array.name for array in panel.export_arrays()]
     assert names == ["matrix", "sigma"]
+
+
+def test_matrices_and_gains_are_listed_again_after_a_crash_of_the_engine(calibrate, source, tmp_path):
+    modes, gains = calibrate.panels["modes"], calibrate.panels["gains"]
+    products = []
+    for method in ("push-pull", "escape"):
+        made = fake.calibration(method, n=24, n_modes=30)
+        path = save_matrix(tmp_path / f"{method}.fits", made, fake.ORIGIN)
+        products.append(ProductEntry(name=method, kind="matrix", path=str(path)))
+    path = save_gains(tmp_path / "gains.fits", fake.gains_result(), "razor-shwfs", True, fake.ORIGIN)
+    products.append(ProductEntry(name="gains", kind="gains", path=str(path)))
+    source.change(products=tuple(products))
+    until(lambda: {"push-pull", "ESCAPE"} <= set(modes.matrices), calibrate)
+    until(lambda: bool(gains._curves), calibrate)
+    names, curves = list(modes.matrices), list(gains._curves)
+    modes.matrix_selector.setFocus()
+    QTest.keyClick(modes.matrix_selector, Qt.Key.Key_Home)
+    modes.matrix_selector.activated.emit(0)
+    source.fail("the engine died")
+    source.change(engine_pid=0)
+    look(calibrate)
+    source.change(engine_pid=12, phase=Phase.STARTING, fault=None)
+    look(calibrate)
+    assert [modes.matrix_selector.itemData(k) for k in range(modes.matrix_selector.count())] == names
+    assert modes.matrix_selector.currentData() == names[0]
+    assert not modes.shows_placeholder
+    assert list(gains._curves) == curves
+    assert not gains.shows_placeholder
 
 
 @pytest.mark.parametrize(
@@ -425,6 +458,24 @@ def test_the_result_is_compared_with_the_previous_one(calibrate, source):
     look(calibrate)
     assert "(Δ 0.00 ± " in panel.numbers.text()
     assert panel.report.isVisible()
+
+
+def test_the_result_outlasts_the_engine_but_not_the_bench(calibrate, source, session, control):
+    panel = calibrate.panels["procedure"]
+    document = calibration_document(fake.calibration("escape"))
+    source.change(last_run=FinishedRun(id=2, name="escape", finish=Finish.DONE, document=document))
+    look(calibrate)
+    told = panel.numbers.text()
+    source.change(engine_pid=12, last_run=None)
+    look(calibrate)
+    assert panel._result_area.isVisible()
+    assert panel.numbers.text() == told
+    source.change(last_run=FinishedRun(id=3, name="escape", finish=Finish.DONE, document=document))
+    look(calibrate)
+    assert "Δ" in panel.numbers.text(), "the result of the engine before is compared"
+    session.set_source(ScriptedSource(running(system="maps-nir")), control)
+    look(calibrate)
+    assert not panel._result_area.isVisible()
 
 
 def test_new_matrices_are_offered_to_the_form(calibrate, source):

@@ -11,6 +11,8 @@ from gui_windows import dispose
 from PySide6.QtCore import Qt
 from PySide6.QtTest import QTest
 from pytestqt.qtbot import QtBot
+from recorded_run import make_run
+from scripted import running
 from test_gui_live import Network
 
 from escape_gui.app import WindowController
@@ -18,10 +20,12 @@ from escape_gui.client import connection as live
 from escape_gui.client.session import EmptySource, Session
 from escape_gui.main_window import MainWindow
 from escape_gui.panels.devices import DevicesPanel
+from escape_gui.replay.source import ReplaySource
 from escape_gui.settings import Settings
 from escape_gui.window.connect_dialog import ConnectDialog
 from escape_hw.remote import keys
 from escape_hw.remote.address import ServerListing, register_server, unregister_server
+from escape_hw.remote.state import LoopState
 from escape_hw.supervision import process_start
 
 
@@ -52,6 +56,7 @@ class StartedServer:
 def network(monkeypatch: pytest.MonkeyPatch) -> Network:
     network = Network()
     monkeypatch.setattr(live, "connect", network.connect)
+    monkeypatch.setattr(live, "_RECONNECT_AFTER_S", 0.1)
     for name in ("_RETRY_S", "_LOCAL_PERIOD_S", "_REMOTE_PERIOD_S"):
         monkeypatch.setattr(live, name, 0.02)
     return network
@@ -160,6 +165,85 @@ def test_a_server_is_started_here_and_left_running_for_another(
     qtbot.waitUntil(lambda: len(network.made) == 2 and network.made[0].closed)
     assert started[0].left
     assert not controller.window.started_server
+
+
+@pytest.fixture
+def recording(tmp_path: Path) -> ReplaySource:
+    return ReplaySource(make_run(tmp_path / "run"))
+
+
+def test_a_recorded_run_stays_when_the_first_connection_is_made(
+    controller: WindowController, network: Network, recording: ReplaySource, qtbot: QtBot
+) -> None:
+    window, session = controller.window, controller.session
+    window.show_recording(recording)
+    # As by the command: the connection is made some seconds later.
+    controller._attach("bench-1", None)
+    qtbot.waitUntil(window.server_banner.isVisible)
+    assert session.source is recording
+    assert session.control is None
+    assert "Connected to bench-1" in window.server_banner.text.text()
+    # A server that was restarted meanwhile waits in the place of the one before.
+    first = network.made[0]
+    first.connected = False
+    qtbot.waitUntil(lambda: len(network.made) == 2 and first.closed)
+    assert session.source is recording
+    qtbot.mouseClick(window.server_banner.button, Qt.MouseButton.LeftButton)
+    assert session.control is network.made[1]
+    assert not window.server_banner.isVisible()
+    window.refresh()
+    assert "REPLAY" not in window.windowTitle()
+
+
+def test_the_dialog_leaves_a_recorded_run(
+    listed: str, controller: WindowController, network: Network, recording: ReplaySource, qtbot: QtBot
+) -> None:
+    window, session = controller.window, controller.session
+    window.show_recording(recording)
+    window.actions_by_name["connect"].trigger()
+    network.reachable = False
+    qtbot.mouseClick(window.connect_dialog.connect_button, Qt.MouseButton.LeftButton)
+    qtbot.waitUntil(lambda: "no server of 'bench-1' runs here" in window.connect_dialog.message.text())
+    assert session.source is recording, "it stays until the window is connected"
+    network.reachable = True
+    qtbot.waitUntil(lambda: session.control is not None)
+    assert not window.connect_dialog.isVisible()
+    # Behind a recorded run, the same connection is used again.
+    window.show_recording(recording)
+    window.replay_windows[0].close()
+    assert session.control is network.made[0]
+
+
+def test_the_dialog_shows_the_server_behind_a_recorded_run(
+    listed: str, controller: WindowController, network: Network, recording: ReplaySource,
+    started: list[StartedServer], qtbot: QtBot,
+) -> None:  # fmt: skip
+    window, session = controller.window, controller.session
+    window.show_recording(recording)
+    server = StartedServer("bench-1")
+    controller._attach("bench-1", server)  # type: ignore[arg-type]
+    qtbot.waitUntil(window.server_banner.isVisible)
+    window.actions_by_name["connect"].trigger()
+    qtbot.mouseClick(window.connect_dialog.connect_button, Qt.MouseButton.LeftButton)
+    assert session.control is network.made[0]
+    assert len(network.made) == 1
+    assert not server.left, "it is still the server of this window"
+    qtbot.waitUntil(lambda: "acquire" in network.made[0].asked)
+
+
+@pytest.mark.parametrize("busy", [False, True])
+def test_a_server_behind_a_recorded_run_is_ended_unless_something_runs_there(
+    controller: WindowController, network: Network, recording: ReplaySource, busy: bool, qtbot: QtBot
+) -> None:
+    controller.window.show_recording(recording)
+    server = StartedServer("bench-1")
+    controller._attach("bench-1", server)  # type: ignore[arg-type]
+    qtbot.waitUntil(controller.window.server_banner.isVisible)
+    network.made[0].state = running(loop=LoopState(closed=busy))
+    controller.window.close()
+    controller.session.close()
+    controller.close()
+    assert (server.left, server.terminated) == (busy, not busy)
 
 
 def test_a_connection_that_fails_says_why(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from datetime import UTC, datetime
+from pathlib import Path
 
 import fake_results as fake
 import numpy as np
@@ -20,6 +21,7 @@ from escape_gui.settings import Settings
 from escape_gui.window.docks import WORKSPACES, visible_sizes
 from escape_hw.api.registration import TO_STREAM_UNITS
 from escape_hw.io.documents import calibration_document
+from escape_hw.io.fits.matrix import save_matrix
 from escape_hw.io.night_log import NightEntry
 from escape_hw.io.provenance import format_utc
 from escape_hw.remote.state import (
@@ -29,6 +31,7 @@ from escape_hw.remote.state import (
     Phase,
     ProcedureEntry,
     ProcedureParameter,
+    ProductEntry,
 )
 
 Show = Callable[[Settings], MainWindow]
@@ -311,3 +314,49 @@ def test_buttons_that_are_held_are_visible_in_the_narrowest_window(
         assert found.poke_text.height() >= found.poke_text.heightForWidth(found.poke_text.width())
         assert found.image_view.geometry().bottom() < found.arm_button.geometry().top()
     assert_is_in_its_dock(getattr(window.panels[panel], button), window, panel)
+
+
+def test_long_names_of_matrices_fit_the_narrowest_window(
+    show: Show, source: ScriptedSource, tmp_path: Path, qtbot: QtBot
+) -> None:
+    names = ("docrime-2026-11-22 214530-17", "escape-2026-11-22 214530-2", "escape-2026-11-22 214530-3")
+    products = []
+    for k, name in enumerate(names):
+        result = fake.calibration(name.split("-", maxsplit=1)[0], n=8, n_modes=6 + k)
+        path = save_matrix(tmp_path / f"{name}.fits", result, fake.ORIGIN)
+        products.append(ProductEntry(name=name, kind="matrix", path=str(path)))
+    loop = source.state.loop.model_copy(update={"matrix": names[-1]})
+    source.change(products=tuple(products), loop=loop)
+    source.entries = (ESCAPE,)
+    window = show(Settings(workspace="calibrate"))
+    window.resize(1024, 700)
+    modes, panel = window.panels["modes"], window.panels["loop"]
+
+    def listed() -> bool:
+        window.update_timer.tick(force=True)
+        return modes.matrix_selector.count() > 2
+
+    qtbot.waitUntil(listed, timeout=30_000)
+    selector = modes.matrix_selector
+    for k in range(selector.count()):
+        selector.setCurrentIndex(k)
+        QApplication.processEvents()
+        for widget in (selector, modes.weight_by_snr):
+            assert_is_in_its_dock(widget, window, "modes")
+        # The first and the last letters distinguish them.
+        assert selector.shown_text[0] == selector.currentText()[0]
+        assert selector.shown_text[-1] == selector.currentText()[-1]
+    short = ("push-pull", "ESCAPE (escape-17)")
+    for text in short:
+        selector.setItemText(selector.currentIndex(), text)
+        QApplication.processEvents()
+        assert selector.shown_text == text
+    window.show_workspace("operate")
+    for _ in range(3):
+        window.update_timer.tick(force=True)
+        QApplication.processEvents()
+    assert wide_panels(window) == set()
+    assert panel.matrix.shown_text.endswith("-3")
+    assert panel.current_matrix.text().endswith("-3")
+    assert panel.current_matrix.toolTip() == names[-1]
+    assert_is_in_its_dock(panel.gain, window, "loop")

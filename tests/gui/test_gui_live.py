@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 from pytestqt.qtbot import QtBot
-from scripted import ScriptedSource, running
+from scripted import CLIENT, ScriptedSource, running
 
 from escape_gui.app import WindowController
 from escape_gui.client import connection as live
@@ -24,12 +24,15 @@ from escape_hw.remote.state import Geometry, ProcedureEntry
 class FakeConnection(ScriptedSource):
     """A connection that records the threads of its slow requests."""
 
+    client = CLIENT
+
     def __init__(self) -> None:
         super().__init__()
         self.push_all()
         self.entries = (ProcedureEntry(name="escape", title="ESCAPE", help=""),)
         self.askers: set[threading.Thread] = set()
         self.closed = False
+        self.asked: list[str] = []
 
     def geometry(self) -> Geometry:
         self.askers.add(threading.current_thread())
@@ -41,6 +44,9 @@ class FakeConnection(ScriptedSource):
 
     def close(self) -> None:
         self.closed = True
+
+    def acquire(self, *, take_over: bool = False) -> None:
+        self.asked.append("acquire")
 
 
 class Network:

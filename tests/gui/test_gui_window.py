@@ -19,7 +19,7 @@ from PySide6.QtWidgets import (
     QTabBar,
 )
 from pytestqt.qtbot import QtBot
-from scripted import ScriptedControl, ScriptedSource
+from scripted import LEASE, ScriptedControl, ScriptedSource
 
 from escape_gui.client.session import EmptySource, Session
 from escape_gui.main_window import MainWindow
@@ -138,6 +138,33 @@ def test_the_end_of_a_run_is_notified(small_window: MainWindow, source: Scripted
     assert (note.title, note.text) == ("escape failed", "too dark\n/runs/2")
     note.close_button.click()
     assert small_window.notifications.notifications == []
+
+
+def test_control_that_another_window_takes_is_told(
+    small_window: MainWindow, source: ScriptedSource, session: Session
+) -> None:
+    shown = small_window.notifications.notifications
+    small_window.refresh()
+    # After a reconnection, the connection before has control until it expires.
+    mine = source.state.lease
+    session.control.client = "e" * 16
+    small_window.refresh()
+    assert shown == []
+    session.control.client = mine.client
+    small_window.refresh()
+    other = LEASE.model_copy(update={"client": "f" * 16, "name": "escape gui", "host": "dome", "pid": 815})
+    source.change(lease=other)
+    small_window.refresh()
+    assert small_window.header.control.text == "another window has control"
+    assert [one.title for one in shown] == ["Control taken"]
+    assert "escape gui on dome (process 815) has taken control" in shown[0].text
+    source.change(lease=mine)
+    small_window.refresh()
+    assert shown == []
+    # Released by this window itself.
+    source.change(lease=None)
+    small_window.refresh()
+    assert shown == []
 
 
 def test_a_restarted_server_is_notified_also_without_a_lost_connection(

@@ -10,8 +10,9 @@ from PySide6.QtGui import QWheelEvent
 from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QApplication, QStyle, QStyleOptionSpinBox, QWidget
 from pytestqt.qtbot import QtBot
-from scripted import ScriptedControl, ScriptedSource
+from scripted import ScriptedControl, ScriptedSource, running
 
+from escape_gui.client.session import EmptySource, Session
 from escape_gui.main_window import MainWindow
 from escape_gui.panels.loop import LoopPanel
 from escape_gui.widgets.controls import HOLD_MS
@@ -234,3 +235,38 @@ def test_numbers_have_a_decimal_point_in_every_language(
         assert loop.message.text() == "Checked: leak 0.02 → 0.05"
     finally:
         QLocale.setDefault(before)
+
+
+def test_setpoints_outlast_the_engine_and_the_connection_but_not_the_system(
+    typist: Typist, loop: LoopPanel, window: MainWindow, source: ScriptedSource, session: Session,
+    control: ScriptedControl, qtbot: QtBot,
+) -> None:  # fmt: skip
+    source.change(phase=Phase.IDLE, loop=OPEN)
+    window.update_timer.tick(force=True)
+    loop.matrix.setFocus()
+    QTest.keyClick(loop.matrix, Qt.Key.Key_End)
+    loop.matrix.activated.emit(loop.matrix.currentIndex())
+    assert loop.matrix.currentText() == "docrime"
+    typist.type(loop.gain, "0.31")
+    loop.check()
+    source.fail("the engine died")
+    source.change(engine_pid=0)
+    window.update_timer.tick(force=True)
+    source.change(engine_pid=12, phase=Phase.STARTING, fault=None, loop=LoopState())
+    window.update_timer.tick(force=True)
+    source.change(phase=Phase.IDLE)
+    window.update_timer.tick(force=True)
+    assert (loop.gain.value(), loop.matrix.currentText()) == (0.31, "docrime")
+    assert loop.message.text() == "Edited before; press Check."
+    assert "press Check first" in loop.close_button.toolTip()
+    session.set_source(EmptySource(), None)
+    window.update_timer.tick(force=True)
+    session.set_source(source, control)
+    window.update_timer.tick(force=True)
+    assert (loop.gain.value(), loop.matrix.currentText()) == (0.31, "docrime")
+    # Another bench has its own values.
+    other = ScriptedSource(running(system="maps-nir", phase=Phase.IDLE, loop=OPEN))
+    session.set_source(other, control)
+    window.update_timer.tick(force=True)
+    assert (loop.gain.value(), loop.matrix.currentText()) == (0.4, "escape")
+    assert loop.message.text() == ""

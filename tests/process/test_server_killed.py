@@ -26,6 +26,9 @@ def test_the_fail_safe_process_flattens_the_mirror_of_a_killed_engine(system, be
     server, spy = bench
     with on_metal(system, server, tmp_path) as served, served.connect(control=True) as client:
         until_idle(client)
+        client.calibrate("docrime", frames=500)
+        products = client.state.products
+        assert [one.name for one in products if one.kind == "matrix"]
         run = client.start("docrime", frames=10_000_000)
         running = client.state.engine_pid
         wait_for(lambda: bool(list(tmp_path.rglob("run.state"))) and not spy.flat, "the mirror is poked")
@@ -40,6 +43,7 @@ def test_the_fail_safe_process_flattens_the_mirror_of_a_killed_engine(system, be
         # The accumulators were kept, and the next engine continues with them.
         client.clear_fault()
         until_idle(client)
+        assert client.state.products == products, "the next engine knows the matrices of the one before"
         (state,) = tmp_path.rglob("run.state")
         kept = load_state_frames(state)
         result = client.calibrate("docrime", resume=str(state.parent), frames=kept + 500)

@@ -41,7 +41,7 @@ class Engine:
         first_run_id = max(setup.first_run_id, last_run_number(setup.runs, config.system.name) + 1)
         state = self._state = EngineState(LoopParameters.from_config(config), first_run_id)
         publisher = self._publisher = StreamPublisher(config.system.name)
-        store = ProductStore((setup.runs, *setup.read_folders))
+        store = ProductStore((setup.runs, *setup.read_folders), setup.products)
         recording = self._recording = TelemetryRecording(
             setup.runs, publisher, lambda: describe_recording(bench, state.snapshot, store)
         )

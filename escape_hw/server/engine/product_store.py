@@ -15,11 +15,19 @@ from escape_hw.remote.state import ProductEntry
 
 
 class ProductStore:
-    """Products by name. Only the paths are stored, not the contents."""
+    """Products by name. Only the paths are stored, not the contents.
 
-    def __init__(self, folders: Iterable[Path]) -> None:
+    Parameters
+    ----------
+    folders
+        Folders that clients may load files from.
+    products
+        Products at the start; those whose file is missing are left out.
+    """
+
+    def __init__(self, folders: Iterable[Path], products: Iterable[ProductEntry] = ()) -> None:
         self._folders = tuple(folder.resolve() for folder in folders)
-        self._products: dict[str, ProductEntry] = {}
+        self._products = {one.name: one for one in products if Path(one.path).is_file()}
 
     @property
     def products(self) -> tuple[ProductEntry, ...]:

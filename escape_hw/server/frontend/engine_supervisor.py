@@ -106,7 +106,8 @@ class EngineSupervisor:
 
     # ------------------------------------------------------------ life
     def start(self) -> None:
-        """Start an engine."""
+        """Start an engine, with the products of the one before."""
+        self._setup = self._setup.model_copy(update={"products": self._published.state.products})
         self._engine = EngineProcess(self._setup, str(self._journal.folder))
         log.info("engine of %s: process %d", self._journal.system, self._engine.process.pid)
 

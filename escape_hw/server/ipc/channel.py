@@ -21,6 +21,7 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict
 
 from escape_hw.io.documents import to_plain_values
+from escape_hw.remote.state import ProductEntry
 from escape_hw.supervision import BackgroundThread
 
 log = logging.getLogger(__name__)
@@ -43,6 +44,8 @@ class EngineSetup(BaseModel):
     read_folders: tuple[Path, ...]
     #: Number of the first run.
     first_run_id: int = 1
+    #: Products that requests may name, of the engine before.
+    products: tuple[ProductEntry, ...] = ()
     #: Silence of the front end after which the mirror is made safe.
     front_end_timeout_s: float = 15.0
 
