@@ -207,7 +207,7 @@ def test_it_stops_at_the_requested_ratio(closed_loop):
 @pytest.mark.parametrize("in_loop", [True, False])
 def test_escape_stops_at_the_requested_accuracy(closed_loop, in_loop):
     with small(NO_LOSS) as bench:
-        options = {"closing": closed_loop} if in_loop else {}
+        options = {"closed_loop": closed_loop} if in_loop else {}
         found = bench.run(escape(bench, frames=8000, until=Target(accuracy=0.4), **options))
         assert_flat(bench)
     assert found.registration.converged
