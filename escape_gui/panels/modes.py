@@ -106,7 +106,10 @@ class ModesPanel(Panel):
         frame = self.context.theme.pixels(_SELECTOR_FRAME_PX)
         others = sum(one.sizeHint().width() for one in (self.weight_by_snr, *self._page_controls))
         gaps = 4 * self._controls.horizontalSpacing() + 2 * self.body.contentsMargins().left()
-        fits = name + frame + others + gaps <= self.width()
+        # Not the width of the panel, which the controls may widen: it would be resized without end.
+        around = self.parentWidget()
+        visible = self.width() if around is None else around.width()
+        fits = name + frame + others + gaps <= visible
         self._controls.addWidget(self.weight_by_snr, *((0, 1) if fits else (1, 0)))
 
     def _make_maps(self) -> None:

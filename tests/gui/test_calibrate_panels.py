@@ -162,6 +162,31 @@ def test_live_maps_belong_to_the_run_that_measures(calibrate, source):
     assert LIVE_LABEL not in panel.matrices
 
 
+def test_controls_of_the_maps_follow_what_is_visible_and_not_what_they_widen(
+    calibrate: MainWindow, source: ScriptedSource
+) -> None:
+    # Otherwise the area around, which gives the panel the width that its controls need, never ends.
+    measure(source, 1.0)
+    look(calibrate)
+    panel, area = calibrate.panels["modes"], calibrate.docks["modes"].widget()
+    assert isinstance(panel, ModesPanel)
+
+    def in_one_line() -> bool:
+        return panel._controls.itemAtPosition(0, 1) is not None
+
+    area.setParent(None)
+    area.resize(331, 640)
+    area.show()
+    QApplication.processEvents()
+    assert not in_one_line()
+    panel.resize(800, 640)
+    assert not in_one_line()
+    area.resize(800, 640)
+    QApplication.processEvents()
+    assert in_one_line()
+    area.setParent(calibrate)
+
+
 def contrast(panel: ModesPanel) -> float:
     """Mean distance of the mosaic's colours from white."""
     picture = panel.mosaic._image.image.astype(float)
