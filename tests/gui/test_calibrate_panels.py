@@ -163,7 +163,7 @@ def test_live_maps_belong_to_the_run_that_measures(calibrate, source):
 
 
 def test_controls_of_the_maps_follow_what_is_visible_and_not_what_they_widen(
-    calibrate: MainWindow, source: ScriptedSource
+    calibrate: MainWindow, source: ScriptedSource, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # Otherwise the area around, which gives the panel the width that its controls need, never ends.
     measure(source, 1.0)
@@ -179,7 +179,9 @@ def test_controls_of_the_maps_follow_what_is_visible_and_not_what_they_widen(
     area.show()
     QApplication.processEvents()
     assert not in_one_line()
-    panel.resize(800, 640)
+    with monkeypatch.context() as wide:
+        wide.setattr(panel, "width", lambda: 800)
+        panel._arrange_controls()
     assert not in_one_line()
     area.resize(800, 640)
     QApplication.processEvents()
