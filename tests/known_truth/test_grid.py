@@ -7,6 +7,7 @@ import pytest
 from scipy import special
 from sensor_frames import N_PIX, WAVELENGTH, flat, pupil_amplitude, sensor
 
+from escape_hw.calibration.acquisition.sensor_setup import find_darkest_pixels
 from escape_hw.config import layouts
 from escape_hw.errors import CalibrationError
 from escape_hw.pipeline.geometry.lenslet_grid import _without_hot_pixels, find_lenslet_grid
@@ -212,3 +213,18 @@ def test_sharp_spots_are_not_taken_for_hot_pixels(spot_px):
     grid = find(frame.astype(np.float32))
     assert grid.valid.all()
     assert_found(grid, 15.49, (20.3, 20.3))
+
+
+def test_where_every_lenslet_is_lit_the_background_is_that_between_the_spots():
+    # Seven lenslets of seven pixels, the whole camera.
+    at = (np.arange(49) % 7 - 3.0) / 1.1
+    frame = (100 + 4000 * np.exp(-(at[:, None] ** 2 + at**2) / 2)).astype(np.float32)
+    between = frame.ravel()[find_darkest_pixels(frame, 4)]
+    assert 100 <= np.median(between) < 140
+
+
+def test_light_below_the_background_is_an_error():
+    frame = np.full((49, 49), -1000.0, np.float32)
+    frame[3::7, 3::7] = 500.0
+    with pytest.raises(CalibrationError, match="brighter than the background"):
+        find_lenslet_grid(frame, n_sub=7, nominal_pitch_px=7.0, threshold=30.0, min_flux=0.3)

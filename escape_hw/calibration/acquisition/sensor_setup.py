@@ -25,8 +25,9 @@ from escape_hw.pipeline.slopes.pyramid import PyramidSlopes
 from escape_hw.pipeline.slopes.shack_hartmann import ShackHartmannSlopes
 from escape_hw.pipeline.statistics import root_mean_square
 
-#: Pixels over which a frame is smoothed to find its dark parts.
-_SMOOTHING_PX = 9
+#: Pixels over which a frame is smoothed to find its dark parts, and their largest share of a lenslet: where all
+#: lenslets are lit, the dark parts are those between the spots.
+_SMOOTHING_PX, _SMOOTHING_SHARE = 9, 0.6
 #: Frames whose mean the geometry is found on.
 SETUP_FRAMES = 200
 #: Relative difference allowed between the modulation of a geometry and the one in force.
@@ -80,6 +81,11 @@ class _ShackHartmann:
             lenslets, shape, dark=dark, flat=bench.flat, threshold=self._threshold(bench)
         )
 
+    @property
+    def smoothing_px(self) -> int:
+        """Pixels over which a frame is smoothed to find its dark parts."""
+        return max(1, min(_SMOOTHING_PX, int(_SMOOTHING_SHARE * self._section.pitch_px)))
+
     def _threshold(self, bench: Bench) -> float:
         """Centre-of-gravity threshold in counts above the background."""
         return self._section.threshold * bench.wfs.info.full_scale
@@ -92,6 +98,7 @@ class _Pyramid:
     # A pyramid has no lattice; on a source its slopes are those of the flat wavefront.
     source_references = "mean"
     uses_run_mean = True
+    smoothing_px = _SMOOTHING_PX
 
     def __init__(self, section: PyramidSection) -> None:
         self._section = section
@@ -156,13 +163,13 @@ def get_sensor_kind(bench: Bench) -> _Pyramid | _ShackHartmann:
     return _Pyramid(section) if isinstance(section, PyramidSection) else _ShackHartmann(section)
 
 
-def _find_darkest_pixels(mean_frame: NDArray[np.float32]) -> NDArray[np.intp]:
+def find_darkest_pixels(mean_frame: NDArray[np.float32], smoothing_px: int) -> NDArray[np.intp]:
     """Flat indices of the pixels without light: the darkest fifth of a smoothed frame.
 
     These are the pixels outside the pupil, without the wings of bright spots. Smoothing makes the choice of
     the darkest independent of the fixed pattern, which would otherwise lower the level.
     """
-    smooth = ndimage.uniform_filter(mean_frame.astype(np.float32), _SMOOTHING_PX)
+    smooth = ndimage.uniform_filter(mean_frame.astype(np.float32), smoothing_px)
     return np.argsort(smooth.ravel())[: max(1, mean_frame.size // 5)]
 
 
@@ -217,10 +224,11 @@ def build_sensor_setup(
     CalibrationError
         No spots or pupil images where the design has them.
     """
-    darkest = _find_darkest_pixels(mean_frame)
+    kind = get_sensor_kind(bench)
+    darkest = find_darkest_pixels(mean_frame, kind.smoothing_px)
     background = float(np.median(mean_frame.ravel()[darkest])) if bench.dark is None else 0.0
     calibrated = _calibrate_frame(bench, mean_frame, background)
-    grid = get_sensor_kind(bench).find(bench, calibrated, references)
+    grid = kind.find(bench, calibrated, references)
     if frame is not None:
         grid = grid.with_pixel_noise(root_mean_square((frame - mean_frame).ravel()[darkest]))
     return SensorSetup(grid.with_background(background), mean_frame)

@@ -216,6 +216,11 @@ def _build_grid(
     flux = area[end, right] - area[top, right] - area[end, left] + area[top, left]
     complete = (end - top >= int(pitch)) & (right - left >= int(pitch))
     flux = np.where(complete, np.maximum(flux, 0.0), 0.0).reshape(n_sub, n_sub)
+    if not flux.any():
+        raise CalibrationError(
+            "no sub-aperture is brighter than the background; check source, exposure, the camera region and "
+            "sensor.pitch_px"
+        )
     # Relative to the 95th percentile, which hot pixels do not affect.
     counts = float(np.percentile(flux[flux > _LEAST_FLUX * flux.max()], 95))
     flux = flux / counts
