@@ -59,7 +59,8 @@ def test_push_pull_with_shortened_pokes(good, name):
             assert_flat(bench)
     free, limited = matrices
     gain = np.vdot(limited.data, free.data) / np.vdot(free.data, free.data)
-    assert gain == pytest.approx(1, abs=0.03)
+    # The spots answer smaller pokes with up to 4 % more: few of their pixels cross the threshold.
+    assert gain == pytest.approx(1, abs=0.05)
     errors = (limited.data - free.data) / np.hypot(limited.sigma, free.sigma)
     # Vibration is common to the frames of a push, so the scatter within it understates a little.
     assert np.mean(np.square(errors)) < 4

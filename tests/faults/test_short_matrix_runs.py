@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from small_bench import INJECTED, small
+from small_system import GAUSSIAN_TWIN
 
 from escape_hw.api.procedure import run
 from escape_hw.calibration.docrime.open_loop import docrime_run
@@ -20,7 +21,8 @@ FRAMES, RUNS = 90, 6
 @pytest.mark.slow
 def test_the_frames_err_less_than_the_sums_of_a_matrix():
     by_frames, by_sums = np.empty((2, RUNS, 5))
-    with small() as bench:
+    # On other mirrors the errors of the model, which both have, are larger than those of the frames.
+    with small(*GAUSSIAN_TWIN) as bench:
         for k in range(RUNS):
             found = bench.run(docrime_run(bench, frames=FRAMES, record=True))
             matrix, grid, solution = found.result.matrix, found.result.grid, found.solution

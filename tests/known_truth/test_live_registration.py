@@ -126,7 +126,8 @@ def test_a_sheared_mirror_is_found_beside_the_registration(number):
     assert np.abs(errors[:2]).max() < 3.0
     shear, before = found.registration.extras["anamorphosis"], start.registration.extras["anamorphosis"]
     assert abs(shear.value - before.value) < 3 * before.sigma
-    assert shear.value == pytest.approx(SHEAR, abs=0.15)
+    # The errors of the live estimate do not contain those of the model.
+    assert abs(shear.value - SHEAR) < 4 * np.hypot(shear.sigma, before.sigma)
     with injected(truth, seed=number) as bench:
         plain = looked(bench, 4, 500)[0]
     assert found.misfit < plain.misfit
