@@ -77,9 +77,6 @@ def test_a_window_that_dies_does_not_disturb_the_loop(number: int, tmp_path: Pat
                 seconds = wait_for(lambda: bench.state.clients == alone + 2, "it is heard again", ATTACH_S)
                 print(f"the halted window was heard {seconds:.1f} s after it went on")
                 assert seconds < 20, "two seconds on an idle machine"
-                # It keeps its client number.
-                known = f"process {windows[0].pid})"
-                assert sum(known in line.text for line in bench.log_after(-1)) == 1
             bench.open_loop()
         finally:
             for one in windows:
