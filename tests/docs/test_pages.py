@@ -61,7 +61,8 @@ def test_a_quotation_is_compared_with_the_output() -> None:
     assert len(differences("Shift X [%] −16.036 ± 0.090  −0.7  −16", printed)) == 1
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
+@pytest.mark.timeout(1800)
 @pytest.mark.parametrize("page", RUN, ids=name_of)
 def test_a_page_can_be_followed_to_its_end(
     page: Path, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory

@@ -9,7 +9,7 @@ from escape_hw.api.results import TemporalResponse
 from escape_hw.calibration.tracking.tracker import track
 from escape_hw.runtime.session.system import open_system
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.campaign, pytest.mark.timeout(1800)]
 
 #: Seconds of tracking after which something happens.
 AT = 6

@@ -15,7 +15,8 @@ HERE = Path(__file__).parent
 LIMIT_MB, GROWTH_MB = 300, 80
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
+@pytest.mark.timeout(1800)
 def test_eight_hours_of_history_need_less_than_300_mb(tmp_path: Path) -> None:
     environment = {
         **os.environ, "QT_QPA_PLATFORM": "offscreen", "OPENBLAS_NUM_THREADS": "1",

@@ -67,7 +67,7 @@ def work_through_the_night(folder: Path, environment: dict[str, str]) -> list[di
     return [json.loads(line) for line in done.stdout.splitlines() if line.startswith("{")]
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 @pytest.mark.timeout(3600)
 @pytest.mark.parametrize("on", ["Xvfb", "offscreen"])
 def test_a_night_of_operation(on: str, tmp_path: Path) -> None:

@@ -68,14 +68,15 @@ def test_escape_through_the_buttons(small: Path, tmp_path: Path) -> None:
         operator.until(lambda: "Aborted" in operator.procedure.outcome.text(), "the outcome is shown")
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
+@pytest.mark.timeout(1800)
 def test_escape_on_the_shack_hartmann_bench(tmp_path: Path) -> None:
     with operating("razor-shwfs", tmp_path) as operator:
         operator.take_control()
         calibrated(operator, operator.run("escape", frames="4000"))
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 @pytest.mark.timeout(1800)
 def test_escape_and_gains_on_the_pyramid_bench(tmp_path: Path) -> None:
     with operating("razor-pywfs", tmp_path) as operator:

@@ -149,7 +149,8 @@ def test_the_pyramid_keeps_shear_and_shifted_images_beside_its_curve():
         assert now.sigma < 1.05 * before.sigma
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
+@pytest.mark.timeout(1800)
 def test_twelve_realisations():
     """A thousand frames at pokes of 0.2 % of the stroke: 1 % of a sub-aperture, 0.02 degrees, 0.1 %."""
     errors, pulls = [], []

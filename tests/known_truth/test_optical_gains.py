@@ -96,7 +96,8 @@ def test_gains_are_those_of_the_frozen_residuals(bench: System, baseline: Calibr
     assert np.median(segment.gains.sigma) < 0.01
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
+@pytest.mark.timeout(1800)
 def test_gains_of_the_bench_are_those_of_the_frozen_residuals() -> None:
     with open_system("razor-pywfs") as bench:
         grid = bench.calibrate("escape", frames=300).grid

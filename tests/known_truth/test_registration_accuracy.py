@@ -68,7 +68,7 @@ def test_no_error_and_no_stated_error_is_below_the_bound(few: Sequence[Realisati
         assert (realisation.sigmas[1, 0] > realisation.exact[0]).all()
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 # 330,000 frames and 120 fits: more than 20 minutes of processor time, in two processes.
 @pytest.mark.timeout(2400)
 def test_thirty_registrations_short_and_two_seconds() -> None:

@@ -16,7 +16,8 @@ from escape_hw.pipeline.psf.strehl import strehl
 LENGTH = 85
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
+@pytest.mark.timeout(1800)
 def test_errors_of_short_loops_are_their_scatter(monkeypatch):
     scatter, stated = [], []
     for seed in (1, 2, 3, 4):

@@ -131,7 +131,8 @@ def _attempt(bench: System):
         return None
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
+@pytest.mark.timeout(1800)
 @pytest.mark.parametrize("frames", [20, 50])
 def test_twenty_realisations(frames):
     found = [_calibrate(number, frames, *GAUSSIAN_TWIN) for number in range(20)]

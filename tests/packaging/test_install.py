@@ -16,7 +16,7 @@ import escape_hw
 
 ROOT = Path(__file__).resolve().parents[2]
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(1200)]
+pytestmark = [pytest.mark.campaign, pytest.mark.timeout(1200)]
 
 
 def run(*command: str, cwd: Path) -> str:

@@ -114,7 +114,7 @@ def test_nothing_grows_within_seconds(system: Path, tmp_path: Path) -> None:
     soak(system, tmp_path, warm_up_s=6, seconds=6, limit_bytes_per_s=500e3)
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 @pytest.mark.timeout(1200)
 def test_nothing_grows_within_ten_minutes(system: Path, tmp_path: Path) -> None:
     soak(system, tmp_path, warm_up_s=60, seconds=600, limit_bytes_per_s=20e3)

@@ -19,7 +19,8 @@ def loops(run: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(table))
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
+@pytest.mark.timeout(1800)
 def test_killed_workers_and_a_killed_sweep_lose_nothing(arguments, tmp_path):
     run, again = tmp_path / "run", tmp_path / "again"
     database = run / "study.db"

@@ -13,7 +13,7 @@ OUTCOMES = (
     "select t.number, md5(a.value_json) from trials t join trial_user_attributes a using (trial_id) "
     "where t.state in ('COMPLETE', 'PRUNED') and a.key = 'outcome' order by 1"
 )
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.campaign, pytest.mark.timeout(1800)]
 
 
 @pytest.fixture(scope="module")
