@@ -77,6 +77,7 @@ STRIDE = 12
 
 
 @pytest.mark.parametrize("kind", FAULT_KINDS)
+@pytest.mark.slow
 def test_a_fault_now_and_then(kind: str) -> None:
     for at in range(FAULT_KINDS.index(kind) % STRIDE, commands_of_a_session(), STRIDE):
         check(kind, at)

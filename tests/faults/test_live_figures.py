@@ -43,6 +43,7 @@ def watched(bench, procedure):
     return bench.run(procedure, observers=(watch,)), shown
 
 
+@pytest.mark.slow
 def test_open_loop_matrix_fills_in_and_costs_the_run_nothing(often):
     with small(QUIET) as bench:
         unwatched = bench.run(docrime_run(bench, frames=3000)).result

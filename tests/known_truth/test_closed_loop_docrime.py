@@ -29,6 +29,7 @@ def gain_of(matrix, truth):
 
 
 @pytest.mark.parametrize("name", CONTROLLERS)
+@pytest.mark.slow
 def test_unbiased_for_any_controller_and_least_squares_is_not(name):
     gains, pulls, squares, modes, delays, plain = [], [], [], [], [], []
     for seed in range(SEEDS):

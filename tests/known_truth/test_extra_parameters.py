@@ -65,6 +65,7 @@ def test_a_shear_and_its_axes_are_the_same_stretch(shear):
     assert not straight.anamorphosis_angle
 
 
+@pytest.mark.slow
 def test_a_shear_is_recovered_within_its_error(model):
     pulls, blind = [], []
     for seed in SEEDS:

@@ -115,6 +115,7 @@ def test_a_mirror_with_a_large_pedestal_is_recovered(design: Design) -> None:
     assert np.mean(errors) < 0.014
 
 
+@pytest.mark.slow
 def test_a_poorly_measured_mirror_is_not_changed(design: Design) -> None:
     """Noise of three times the elements' rms: single actuators cannot be distinguished."""
     found, nominal = compared(design, 3.0).T

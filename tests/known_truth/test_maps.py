@@ -79,6 +79,7 @@ def test_the_matrix_has_the_hidden_registration(system, found):
     assert likeness(injected) > likeness(flipped)
 
 
+@pytest.mark.slow
 def test_disabled_actuators_take_no_part(system, found):
     disabled = list(system.config.devices.dm.limits.disabled)
     assert len(disabled) == 10

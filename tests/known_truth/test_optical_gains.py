@@ -89,6 +89,7 @@ def assert_true(segment: LoopSegment, truth: np.ndarray, every: int = 1) -> None
     assert 0.1 < np.mean(pulls**2) < 2.0
 
 
+@pytest.mark.slow
 def test_gains_are_those_of_the_frozen_residuals(bench: System, baseline: CalibrationResult) -> None:
     segment, truth = measured(bench, baseline, 6000, 100)
     assert_true(segment, truth)

@@ -182,7 +182,8 @@ VARIETIES = {
 }
 
 
-@pytest.mark.parametrize("variety", [pytest.param("modulated", marks=pytest.mark.slow), "still", "local"])
+@pytest.mark.parametrize("variety", ["modulated", "still", "local"])
+@pytest.mark.slow
 def test_matrices_equal_those_of_oopao(variety):
     config = configuration(*VARIETIES[variety])
     for registration, width in ((Registration(), 1.0), (INJECTED, 1.1)):

@@ -29,6 +29,7 @@ def find(image: np.ndarray, **more: Any) -> PyramidPupils:
     ],
     ids=["even", "noise and offset", "uneven by a quarter"],
 )
+@pytest.mark.slow
 def test_centres_are_found(light: dict[str, float], bound: float) -> None:
     errors = []
     for seed in SEEDS:

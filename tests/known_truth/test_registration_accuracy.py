@@ -48,6 +48,7 @@ def test_three_hundred_frames_meet_the_goal(few: Sequence[RealisationErrors]) ->
     assert curves["fewest_frames"]["whitened"] == 300
 
 
+@pytest.mark.slow
 def test_whitening_is_what_meets_it(few: Sequence[RealisationErrors]) -> None:
     curves = summary(few, (300,))
     assert not _meets_goal(curves, "unwhitened", 300)

@@ -63,6 +63,7 @@ def says(started: subprocess.Popen[str]) -> str:
 
 # With two slots the reader is overtaken all the time, with eight hardly ever.
 @pytest.mark.parametrize("slots", [2, 8])
+@pytest.mark.slow
 def test_no_frame_is_torn_at_full_speed(slots: int) -> None:
     with process(WRITER, str(slots)) as writer, RingReader(says(writer)) as reader:
         index, read, torn, again = -1, 0, 0, 0

@@ -84,6 +84,7 @@ def test_a_client_that_floods_and_never_reads_stops_nothing(
     assert "not read" in served.log.read_text() or any("not read" in one.text for one in bench.log_after(-1))
 
 
+@pytest.mark.slow
 def test_clients_that_leave_free_their_places(bench: Connection) -> None:
     for _ in range(MAX_CLIENTS + 10):
         with connect(SYSTEM) as one:

@@ -208,6 +208,7 @@ def test_on_another_computer_the_samples_come_through_requests(bench: Connection
         wait_for(lambda: far.connected and far.state.serial > 1, "events")
 
 
+@pytest.mark.slow
 def test_without_a_server_none_is_found(served: Served) -> None:
     with pytest.raises(
         ServerGone, match=r"no server of 'elsewhere' runs here .*start one with 'escape serve"

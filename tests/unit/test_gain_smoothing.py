@@ -26,6 +26,7 @@ def trials(scatter: float, noise: float, count: int = 12):
 
 
 @pytest.mark.parametrize(("scatter", "noise"), [(0.0, 0.02), (0.0, 0.15), (0.04, 0.02), (0.04, 0.15)])
+@pytest.mark.slow
 def test_errors_are_correct_with_and_without_deviations(scatter, noise):
     trend, trend_sigma, best, best_sigma, _ = trials(scatter, noise)
     assert 0.4 < np.mean((trend / trend_sigma) ** 2) < 1.8

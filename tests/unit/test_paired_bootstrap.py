@@ -20,6 +20,7 @@ def injected(seed: int, n: int, difference: float, skewed: bool) -> tuple[np.nda
 
 @pytest.mark.parametrize("skewed", [False, True])
 @pytest.mark.parametrize("n", [12, 24])
+@pytest.mark.slow
 def test_the_interval_holds_the_truth_as_often_as_it_says(n, skewed):
     inside = margin = 0
     for seed in range(REPEATS):

@@ -128,6 +128,7 @@ def test_a_sweep_on_an_open_bench(tmp_path):
 @pytest.mark.parametrize(
     ("difference", "word"), [(0.0, "equivalent"), (0.05, "ESCAPE better"), (-0.05, "worse")]
 )
+@pytest.mark.slow
 def test_conclusions(difference, word):
     result = analyse_sweep(SWEPT, synthetic_run(difference), 0.01)
     (one,) = result.comparisons

@@ -77,6 +77,7 @@ def test_a_stopped_peer_is_reported_in_time_and_rests_when_it_continues(
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
+@pytest.mark.slow
 def test_a_client_that_ends_or_hangs_leaves_the_shell_at_rest(number: signal.Signals) -> None:
     with emulator(hold_s=0.3, rest_s=1.5) as made:
         words = [sys.executable, "-c", _CLIENT, str(port_of(made))]

@@ -69,6 +69,7 @@ def length(driver: str) -> int:
 @pytest.mark.parametrize(
     ("driver", "action"), [(d, action) for d, actions in ACTIONS.items() for action in actions]
 )
+@pytest.mark.slow
 def test_a_fault_at_each_call(driver: str, action: str) -> None:
     n_calls = length(driver)
     assert n_calls >= 10

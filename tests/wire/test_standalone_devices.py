@@ -36,6 +36,7 @@ def stage(**settings) -> PiModulator:
 
 
 @parametrize_device_checks({"alpao": mirror, "ximea": camera, "pi-e727": stage})
+@pytest.mark.slow
 def test_contract(factory: Factory, check: Check) -> None:
     check(factory)
 

@@ -25,8 +25,8 @@ from escape_hw.pipeline.slopes.pyramid import PyramidSlopes
 from escape_hw.pipeline.slopes.shack_hartmann import ShackHartmannSlopes
 from escape_hw.pipeline.statistics import root_mean_square
 
-#: Pixels over which a frame is smoothed to find its dark parts, and their largest share of a lenslet: where all
-#: lenslets are lit, the dark parts are those between the spots.
+#: Pixels over which a frame is smoothed to find its dark parts, and their largest share of a lenslet: where
+#: all lenslets are lit, the dark parts are those between the spots.
 _SMOOTHING_PX, _SMOOTHING_SHARE = 9, 0.6
 #: Frames whose mean the geometry is found on.
 SETUP_FRAMES = 200
