@@ -5,8 +5,10 @@ from __future__ import annotations
 import os
 import signal
 import subprocess
+import sys
 import time
 
+from escape_hw.server.frontend import supervisor
 from escape_hw.supervision import BackgroundThread, ChildProcess, is_alive, process_start
 
 
@@ -38,3 +40,18 @@ def test_a_periodic_thread_ends_when_stopped() -> None:
         time.sleep(0.01)
     thread.stop()
     assert not thread.is_alive()
+
+
+def test_a_server_waits_for_its_own_processes_only() -> None:
+    other = subprocess.Popen(
+        [sys.executable, "-c", "import sys; sys.stdin.read(); sys.exit(7)"], stdin=subprocess.PIPE
+    )
+    others = supervisor._children()
+    assert other.pid in others
+    own = subprocess.Popen(["sleep", "0.1"])
+    # It would wait for the other one until its limit.
+    supervisor._reap_orphans(others)
+    assert process_start(own.pid) is None
+    own.returncode = 0
+    other.communicate()
+    assert other.returncode == 7

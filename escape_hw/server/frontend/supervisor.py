@@ -72,11 +72,14 @@ class FrontEndSupervisor:
             read_folders=read_folders, server_pid=pid, first_number=_first_number(),
         )  # fmt: skip
         self._process: ChildProcess | None = None
+        #: Child processes that this process has for other purposes.
+        self._others: frozenset[int] = frozenset()
 
     def __enter__(self) -> Self:
         """Start the front end."""
         # Makes it possible to wait for the engine of a dead front end.
         ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
+        self._others = _children()
         try:
             self._start()
             register_server(self.listing)
@@ -121,7 +124,7 @@ class FrontEndSupervisor:
         log.error("the front end (process %d) died with code %s", process.pid, code)
         self._process = None
         self._setup = self._setup.model_copy(update={"first_number": _first_number()})
-        _reap_orphans()
+        _reap_orphans(self._others)
 
     def _restart(self, backoff: Backoff) -> None:
         pause_s = backoff.begin_attempt()
@@ -153,7 +156,7 @@ class FrontEndSupervisor:
             _request_stop(process)
             if not process.wait_or_kill(_STOP_TIMEOUT_S):
                 log.error("the front end did not end within %g s and was killed", _STOP_TIMEOUT_S)
-            _reap_orphans()
+            _reap_orphans(self._others)
 
 
 def _first_number() -> int:
@@ -170,10 +173,25 @@ def _request_stop(process: ChildProcess) -> None:
         process.stdin.close()
 
 
-def _reap_orphans() -> None:
-    """Wait until engine, fail-safe process and recorder of a dead front end have ended."""
+def _children() -> frozenset[int]:
+    """Processes whose parent is this process."""
+    own, found = str(os.getpid()), set()
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit():
+            with contextlib.suppress(OSError):
+                # State and parent follow the name, which may contain anything.
+                if (entry / "stat").read_text().rpartition(")")[2].split()[1] == own:
+                    found.add(int(entry.name))
+    return frozenset(found)
+
+
+def _reap_orphans(others: frozenset[int]) -> None:
+    """Wait until engine, fail-safe process and recorder of a dead front end ended; not for ``others``."""
     deadline = time.monotonic() + _STOP_TIMEOUT_S
-    with contextlib.suppress(ChildProcessError):
-        while time.monotonic() < deadline:
-            if os.waitpid(-1, os.WNOHANG) == (0, 0):
-                time.sleep(_POLL_S)
+    while (left := _children() - others) and time.monotonic() < deadline:
+        ended = False
+        for pid in left:
+            with contextlib.suppress(ChildProcessError):
+                ended |= os.waitpid(pid, os.WNOHANG) != (0, 0)
+        if not ended:
+            time.sleep(_POLL_S)
