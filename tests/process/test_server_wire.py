@@ -209,7 +209,8 @@ def test_on_another_computer_the_samples_come_through_requests(bench: Connection
 
 
 @pytest.mark.slow
-def test_without_a_server_none_is_found(served: Served) -> None:
+def test_without_a_server_none_is_found(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", served.environment["XDG_RUNTIME_DIR"])
     with pytest.raises(
         ServerGone, match=r"no server of 'elsewhere' runs here .*start one with 'escape serve"
     ):
