@@ -53,8 +53,8 @@ def _count_text(count: int) -> str:
 class HistogramPlot(Plot):
     """Counts by bin of durations in microseconds.
 
-    The axis ends at the 99.9th percentile, or at five times the median if that is less, as it is with few
-    counts and an outlier; the number of counts beyond is written into the plot.
+    The axis ends at the 99.9th percentile or at five times the median, whichever is smaller (the latter with
+    few counts and an outlier); the plot states the number of counts beyond.
     """
 
     def __init__(self, theme: Theme, name: str, x: str, number: int) -> None:

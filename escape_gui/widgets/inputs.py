@@ -102,7 +102,7 @@ class NameSelector(QComboBox):
 
     @property
     def shown_text(self) -> str:
-        """The name as it is drawn."""
+        """The displayed text: the name, elided in the middle if it does not fit."""
         option = QStyleOptionComboBox()
         self.initStyleOption(option)
         place = self.style().subControlRect(

@@ -38,7 +38,7 @@ def pull(found) -> np.ndarray:
 @pytest.mark.parametrize(
     "name",
     [
-        "as it is",
+        "undisturbed",
         "lost frames",
         pytest.param("vibration", marks=pytest.mark.slow),
         pytest.param("a matrix half as large", marks=pytest.mark.slow),
