@@ -102,14 +102,14 @@ class ModesPanel(Panel):
     def _arrange_controls(self) -> None:
         """Put the check box into a line of its own where the name of the matrix would be cut."""
         selector = self.matrix_selector
-        name = selector.fontMetrics().horizontalAdvance(selector.currentText())
-        frame = self.context.theme.pixels(_SELECTOR_FRAME_PX)
+        text = selector.fontMetrics().horizontalAdvance(selector.currentText())
+        name = max(text + self.context.theme.pixels(_SELECTOR_FRAME_PX), selector.minimumSizeHint().width())
         others = sum(one.sizeHint().width() for one in (self.weight_by_snr, *self._page_controls))
         gaps = 4 * self._controls.horizontalSpacing() + 2 * self.body.contentsMargins().left()
         # Not the width of the panel, which the controls may widen: it would be resized without end.
         around = self.parentWidget()
         visible = self.width() if around is None else around.width()
-        fits = name + frame + others + gaps <= visible
+        fits = name + others + gaps <= visible
         self._controls.addWidget(self.weight_by_snr, *((0, 1) if fits else (1, 0)))
 
     def _make_maps(self) -> None:

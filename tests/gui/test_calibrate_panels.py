@@ -179,6 +179,16 @@ def test_controls_of_the_maps_follow_what_is_visible_and_not_what_they_widen(
     area.show()
     QApplication.processEvents()
     assert not in_one_line()
+    # A name shorter than the selector can become, and several pages: nothing is wider than what is visible.
+    for button in panel._page_controls:
+        button.show()
+    for width in range(250, 500, 10):
+        panel.matrix_selector.setItemText(panel.matrix_selector.currentIndex(), "r")
+        area.resize(width, 640)
+        QApplication.processEvents()
+        assert not in_one_line() or panel.width() <= width
+    area.resize(331, 640)
+    QApplication.processEvents()
     with monkeypatch.context() as wide:
         wide.setattr(panel, "width", lambda: 800)
         panel._arrange_controls()

@@ -102,7 +102,9 @@ def draw_psfs(
     reference = max((float(image.max(initial=1e-12)) for image in references), default=1.0)
     panels_left = iter(panels.ravel())
     if model_image is not None:
-        _psf_panel(next(panels_left), model_image, reference, psf_px, "model", None)
+        _psf_panel(
+            next(panels_left), model_image, reference, psf_px, "model", None, missing="without turbulence"
+        )
     for label, image in images.items():
         scaled = image if model_image is None else _scale_to_flux(image, float(model_image.sum()))
         _psf_panel(next(panels_left), scaled, reference, psf_px, label, shown[label].strehl)
@@ -134,7 +136,9 @@ def _psf_panel(
     psf_px: float | None,
     title: str,
     strehl: StrehlEstimate | None,
+    missing: str = "no Strehl ratio",
 ) -> None:
+    """Draw an image; ``missing`` stands below it where there is no Strehl ratio."""
     cropped = _crop_around_peak(image)
     stretched = np.log10(np.maximum(cropped / reference, 10.0**-_DECADES))
     half = cropped.shape[0] / 2 / (psf_px or 1.0)
@@ -155,7 +159,7 @@ def _psf_panel(
         below = "\n".join(f"{name:>9}  {format_percent(value)}" for name, value in rows)
         axes.set_xlabel(below, family="monospace", fontsize=8, labelpad=5, color=style.INK)
     else:
-        axes.set_xlabel("without turbulence", fontsize=8.5, labelpad=5, color=style.MUTED)
+        axes.set_xlabel(missing, fontsize=8.5, labelpad=5, color=style.MUTED)
 
 
 def _subtract_background(image: NDArray[np.float32]) -> NDArray[np.float64]:
