@@ -9,7 +9,7 @@ from datetime import datetime
 from functools import partial
 from pathlib import Path
 
-from PySide6.QtCore import QByteArray, QPoint, QRect, QSize, Qt, QTimer
+from PySide6.QtCore import QByteArray, QPoint, QRect, QSize, Qt, QTimer, Signal
 from PySide6.QtGui import QAction, QCloseEvent, QKeySequence, QResizeEvent
 from PySide6.QtWidgets import (
     QApplication,
@@ -91,6 +91,9 @@ class MainWindow(QMainWindow):
 
     The settings are saved into the file ``settings_path``, if given, on closing.
     """
+
+    #: The window has been closed.
+    closed = Signal()
 
     def __init__(
         self,
@@ -522,6 +525,7 @@ class MainWindow(QMainWindow):
         kinds = [type(panel) for panel in self.panels.values()]
         other = MainWindow(Session(), self._settings.model_copy(deep=True), None, kinds)
         self.replay_windows.append(other)
+        other.closed.connect(partial(self._forget_replay_window, other))
         other.show_recording(source)
         # It has no server, and needs none: this window stays on its own.
         other.actions_by_name["connect"].setVisible(False)
@@ -530,6 +534,12 @@ class MainWindow(QMainWindow):
         other.resize(round(0.85 * self.width()), round(0.85 * self.height()))
         other.move(self.pos() + QPoint(_REPLAY_OFFSET_PX, _REPLAY_OFFSET_PX))
         other.show()
+
+    def _forget_replay_window(self, other: MainWindow) -> None:
+        """Release a recorded run with its window, which may hold gigabytes."""
+        self.replay_windows.remove(other)
+        other.context.session.close()
+        other.deleteLater()
 
     def close_without_question(self) -> None:
         """Close; a server that this window started goes on if something runs there."""
@@ -570,11 +580,8 @@ class MainWindow(QMainWindow):
         self.update_timer.stop()
         self.replay.close()
         self.run_browser.hide()
-        for other in self.replay_windows:
+        for other in [*self.replay_windows]:
             other.close()
-            other.context.session.close()
-            other.deleteLater()
-        self.replay_windows.clear()
         self._store_layout()
         theme, settings = self.context.theme, self._settings
         settings.geometry = _text(self.saveGeometry())
@@ -582,6 +589,7 @@ class MainWindow(QMainWindow):
         settings.workspace = self.workspace.name
         self._save_settings()
         super().closeEvent(event)
+        self.closed.emit()
 
     def _save_settings(self) -> None:
         if self._settings_path is not None:

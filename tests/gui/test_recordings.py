@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import recorded_run
+import shiboken6
 from gui_windows import dispose
-from PySide6.QtCore import QMimeData, QPoint, QPointF, Qt, QUrl
+from PySide6.QtCore import QEvent, QMimeData, QPoint, QPointF, Qt, QUrl
 from PySide6.QtGui import QDragEnterEvent, QDropEvent
 from PySide6.QtWidgets import QApplication, QFileDialog
 
@@ -170,3 +171,13 @@ def test_a_window_on_a_bench_opens_recorded_runs_in_another_window(small_window,
     assert np.array_equal(
         other.context.session.source.latest("valid").data > 0, recorded_run.calibration("escape").grid.valid
     )
+
+
+def test_a_closed_replay_is_released(small_window, folder):
+    small_window.show_recording(ReplaySource(folder))
+    (other,) = small_window.replay_windows
+    other.close()
+    assert not small_window.replay_windows
+    QApplication.sendPostedEvents(other, QEvent.Type.DeferredDelete)
+    assert not shiboken6.isValid(other)
+    small_window.refresh()
