@@ -83,6 +83,8 @@ def _difference(run: RunContent | None, first: str, second: str) -> str | None:
     """Strehl (peak) of one loop minus another's, with both errors."""
     if run is None or first not in run.loops or second not in run.loops:
         return None
+    if unstable := [name for name in (first, second) if not run.loops[name].stable]:
+        return f"no stable loop with the matrix of {' and '.join(unstable)}"
     a, b = run.loops[first].strehl, run.loops[second].strehl
     if a is None or b is None:
         return "no Strehl ratio: the loops were too short"

@@ -32,6 +32,13 @@ def test_loops_too_short_for_a_strehl_ratio_do_not_count_as_compared():
     assert met(escape=replace(fake.loop(), strehl=unknown)) == [True, True, False]
 
 
+def test_a_loop_that_is_not_stable_is_reported_once():
+    found = criteria.loop_criteria(
+        {"push-pull": replace(fake.loop("push-pull"), stable=False, strehl=None), "ESCAPE": fake.loop()}
+    )
+    assert [check["text"] for check in found if not check["met"]] == ["push-pull: loop stable"]
+
+
 def test_without_a_science_camera_there_is_nothing_to_compare():
     assert met(escape=replace(fake.loop(), strehl=None, model_psf=None)) == [True, True]
 

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
+from types import SimpleNamespace
 
+import fake_results as fake
 import pytest
 from synthetic_sweep import SWEPT, synthetic_run
 
 from escape_hw.errors import ConfigError
 from escape_hw.io.run_folder import RunFolder
+from escape_hw.paper import results
 from escape_hw.paper.cases import find_sweeps
 from escape_hw.paper.results import write_results
 from escape_hw.report.run_report import write_report
@@ -70,3 +74,18 @@ def test_a_sweep_that_was_interrupted_is_not_taken_for_a_finished_one(sweep_run,
     (tmp_path / "result.json").write_text(json.dumps({**document, "partial": True}))
     with pytest.raises(ConfigError, match="unfinished; finish it"):
         find_sweeps([tmp_path])
+
+
+@pytest.mark.parametrize(
+    ("stable", "words"),
+    [
+        (True, "no Strehl ratio: the loops were too short"),
+        (False, "no stable loop with the matrix of push-pull"),
+    ],
+)
+def test_the_reason_for_no_strehl_ratio_is_stated(stable, words):
+    loops = {
+        "push-pull": replace(fake.loop("push-pull"), stable=stable, strehl=None),
+        "ESCAPE": replace(fake.loop(), strehl=None),
+    }
+    assert results._difference(SimpleNamespace(loops=loops), "ESCAPE", "push-pull") == words

@@ -96,6 +96,8 @@ def loop_criteria(results: Mapping[str, LoopResult]) -> list[dict[str, Any]]:
     baseline = results.get(name)
     if escape is None or baseline is None or escape.model_psf is None or baseline.model_psf is None:
         return criteria_met
+    if not (escape.stable and baseline.stable):
+        return criteria_met  # which one is not stable is said above, and there is nothing to compare
     if escape.strehl is None or baseline.strehl is None or not math.isfinite(escape.strehl.peak.sigma):
         return [
             *criteria_met,
