@@ -6,8 +6,8 @@
 Both matrices come from the same frames. Each seed is a twin with a mirror and turbulence of its own, the
 same at all magnitudes, and each matrix is closed at its own best gain on equal turbulence
 (``loop_comparison.py``). A calibration that is refused counts as a Strehl ratio of zero, its message is kept.
-Prints the table and draws ``SYSTEM.png`` beside the raw tables ``SYSTEM-MAGNITUDE.jsonl``. A seed takes one
-minute of an idle core. The other options are those of ``loop_comparison.py``.
+Prints the table and draws ``SYSTEM.png`` beside the raw tables ``SYSTEM-MAGNITUDE.jsonl``. A seed takes two
+minutes of an idle core. The other options are those of ``loop_comparison.py``.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ def main() -> None:
     """Measure what is missing, print the table, and draw the figure."""
     parser = comparison_parser(__doc__, "maps-nir")
     parser.add_argument("--magnitudes", type=float, nargs="+", default=[float(m) for m in range(5, 13)])
-    parser.set_defaults(gains=False, baseline=0, seeds=[1, 2, 3])
+    parser.set_defaults(baseline=0, seeds=[1, 2, 3])
     options = parser.parse_args()
     tables: dict[float, list[Line]] = {}
     overrides, out = list(options.set), options.out
