@@ -1,5 +1,4 @@
-"""Strehl ratios on equal turbulence of ESCAPE, push-pull (the baseline) and DO-CRIME alone, and
-registrations.
+"""Strehl ratios on equal turbulence of ESCAPE, DO-CRIME and push-pull (the baseline), and registrations.
 
     python benchmarks/studies/loop_comparison.py --seeds 1 2 3 4 5 6 7 8 9 10 --out paired
     python benchmarks/studies/loop_comparison.py --system revolt-shwfs --seeds 1 2 3 4 5 --short 1000 \\
@@ -10,13 +9,13 @@ registrations.
 Each seed is a twin with a mirror and turbulence of its own. Every matrix is closed at its own best gain,
 found on the first seconds of that turbulence with a margin: the gain whose Strehl ratio is highest also if
 it were larger by a fifth, since a loop at the limit of stability does not outlast the turbulence that it was
-found on. It is evaluated on later turbulence, the same for all. On a pyramid
-ESCAPE is scaled by its optical gains, unless ``--no-gains`` asks for the matrix as calibrated. Matrices and
-loops are saved in a folder and are not repeated; with ``--minutes 4`` nothing new is started after four
-minutes, and the next call continues. Prints the table of the finished seeds, with the differences paired by
-seed and their two-sided 95 % intervals (Student's t). ``--table`` is the folder of the raw table
-(``SYSTEM-NAME.jsonl``, a line per seed) and of the page made from it (``SYSTEM-NAME.md``). A seed of the
-pyramid bench takes some six minutes on an idle core.
+found on. It is evaluated on later turbulence, the same for all. On a pyramid the matrices of ESCAPE and
+DO-CRIME are scaled by their optical gains (``+ OG``); DO-CRIME's is also closed as measured. With
+``--no-gains`` both are as calibrated. Matrices and loops are saved in a folder and are not repeated; with
+``--minutes 4`` nothing new is started after four minutes, and the next call continues. Prints the table of
+the finished seeds, with the differences paired by seed and their two-sided 95 % intervals (Student's t).
+``--table`` is the folder of the raw table (``SYSTEM-NAME.jsonl``, a line per seed) and of the page made from
+it (``SYSTEM-NAME.md``). A seed of the pyramid bench takes some six minutes on an idle core.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from itertools import pairwise
+from itertools import combinations, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +40,8 @@ from escape_hw.api.results import CalibrationResult
 from escape_hw.calibration.loop.performance import close_loop
 from escape_hw.calibration.loop.runner import minimum_strehl_frames
 from escape_hw.calibration.optical_gain.bootstrap import bootstrap_gains
+from escape_hw.calibration.optical_gain.matrix_comparison import scale_matrix
+from escape_hw.calibration.optical_gain.smoothing import clip_gains
 from escape_hw.calibration.sprint.synthetic_matrix import static_light_matrix
 from escape_hw.config.loader import load_system
 from escape_hw.config.sensor import PyramidSection
@@ -50,7 +51,9 @@ from escape_hw.runtime.session.record import BenchRecord
 from escape_hw.runtime.session.system import System, open_system
 from escape_sim.devices.true_optical_gains import get_simulated_bench
 
-ESCAPE, BASELINE, DOCRIME = "ESCAPE", "push-pull", "DO-CRIME alone"
+ESCAPE, BASELINE, DOCRIME, GAINS = "ESCAPE", "push-pull", "DO-CRIME", " + OG"
+#: Each is compared with those after it.
+PAIRED = (ESCAPE + GAINS, ESCAPE, DOCRIME + GAINS, DOCRIME, BASELINE)
 #: Start times of evaluated loops and bootstrap on the twin's clock, each after the previous turbulence.
 EVALUATION_START_S, BOOTSTRAP_START_S = 4.0, 10.0
 #: Gains tried, relative to the usual one in effect; while the best is at an end, further ones by this ratio,
@@ -90,11 +93,17 @@ class SeedRun:
 
     def matrix(self, name: str, make: Callable[[System], CalibrationResult]) -> CalibrationResult:
         """A matrix, measured unless it is saved already."""
-        path = self._folder / f"{name}.fits"
-        if not path.exists():
+        if not self._path(name).exists():
             with self.open_bench() as bench:
-                save_matrix(path, make(bench), BenchRecord.from_bench(bench).origin())
-        return load_matrix(path).result
+                self.save_matrix(name, make(bench), bench)
+        return load_matrix(self._path(name)).result
+
+    def save_matrix(self, name: str, result: CalibrationResult, bench: System) -> None:
+        """Save a matrix that was measured beside another."""
+        save_matrix(self._path(name), result, BenchRecord.from_bench(bench).origin())
+
+    def _path(self, name: str) -> Path:
+        return self._folder / f"{name}.fits"
 
     def model_psf(self) -> NDArray[np.float32]:
         """The image without turbulence."""
@@ -118,9 +127,10 @@ class SeedRun:
         print(f"seed {self.number}: {json.dumps(self._records[what])}", flush=True)
 
 
-def scaled_by_optical_gains(seed: SeedRun, escape: CalibrationResult) -> CalibrationResult:
-    """The matrix of ESCAPE, scaled by the optical gains that the bootstrap finds."""
-    options = seed.options
+def scaled_by_optical_gains(seed: SeedRun, escape: CalibrationResult) -> dict[str, CalibrationResult]:
+    """ESCAPE's matrix and DO-CRIME's, each scaled by its optical gains as the bootstrap finds them."""
+    options, measured = seed.options, escape.measured
+    assert measured is not None
 
     def rescaled_matrix(bench: System) -> CalibrationResult:
         get_simulated_bench(bench).advance_to(BOOTSTRAP_START_S)
@@ -130,6 +140,7 @@ def scaled_by_optical_gains(seed: SeedRun, escape: CalibrationResult) -> Calibra
                 escape,
                 frames=options.frames,
                 accuracy=options.accuracy,
+                comparisons={DOCRIME: measured},
                 closed_loop_matrix=static_light_matrix(bench, escape),
             )
         )
@@ -141,9 +152,13 @@ def scaled_by_optical_gains(seed: SeedRun, escape: CalibrationResult) -> Calibra
             "errors": [one.gains.common_sigma for one in result.rounds],
         }
         seed.add_record("bootstrap", found)
+        gains = result.comparisons[DOCRIME]
+        matrix = scale_matrix(measured, clip_gains(gains), gains.best_sigma)
+        seed.save_matrix("docrime-gains", replace(escape, matrix=matrix, measured=None), bench)
         return run.rescaled_calibration
 
-    return seed.matrix("gains", rescaled_matrix)
+    scaled = seed.matrix("gains", rescaled_matrix)
+    return {ESCAPE + GAINS: scaled, DOCRIME + GAINS: seed.matrix("docrime-gains", rescaled_matrix)}
 
 
 def matrices(seed: SeedRun) -> dict[str, CalibrationResult]:
@@ -152,7 +167,7 @@ def matrices(seed: SeedRun) -> dict[str, CalibrationResult]:
     escape = seed.matrix("escape", lambda bench: bench.calibrate("escape", frames=options.calibration))
     if escape.measured is None:
         raise SystemExit(f"{options.calibration} frames are too few for a DO-CRIME matrix")
-    found = {ESCAPE: scaled_by_optical_gains(seed, escape) if options.gains else escape}
+    found = scaled_by_optical_gains(seed, escape) if options.gains else {ESCAPE: escape}
     if options.baseline:
         found[BASELINE] = seed.matrix(
             "push-pull", lambda bench: bench.calibrate("push-pull", frames=options.baseline, grid=escape.grid)
@@ -210,9 +225,10 @@ def best_with_margin(scan: Mapping[float, float]) -> float:
 def evaluate_matrices(seed: SeedRun) -> dict[str, tuple[float, float]]:
     """Strehl ratio in % of each matrix at its own best gain, and that gain relative to the usual one."""
     each, found, options = matrices(seed), {}, seed.options
+    reference = next(iter(each.values())).matrix.data.std(0)
     for name, result in each.items():
         # Gains of equal effect, independent of the scale of the matrix.
-        share = float(np.median(result.matrix.data.std(0) / each[ESCAPE].matrix.data.std(0)))
+        share = float(np.median(result.matrix.data.std(0) / reference))
         one = partial(closed_loop_strehl, seed, name, result, share)
         scan = {factor: one(factor, options.scan, 0.0) for factor in FACTORS}
         for _ in range(MAX_FURTHER):
@@ -257,11 +273,10 @@ def strehl_lines(rows: Sequence[Line]) -> list[str]:
         lines.append(f"| {row['realisation']} | {cells} |")
     values = {name: np.array([row["strehl"][name] for row in rows]) for name in names}
     lines += ["| mean | " + " | ".join(f"{values[name].mean():.2f}" for name in names) + " |", ""]
-    pairs = [(ESCAPE, BASELINE), (DOCRIME, BASELINE), (ESCAPE, DOCRIME)]
+    pairs = combinations([name for name in PAIRED if name in names], 2)
     return lines + [
         f"- {one} minus {other}: {interval(values[one] - values[other])} % of Strehl ratio"
         for one, other in pairs
-        if one in values and other in values
     ]
 
 

@@ -17,14 +17,22 @@ import time
 from pathlib import Path
 
 import numpy as np
-from loop_comparison import DOCRIME, ESCAPE, comparison_parser, complete_options, interval, measure_seed
+from loop_comparison import (
+    DOCRIME,
+    ESCAPE,
+    GAINS,
+    comparison_parser,
+    complete_options,
+    interval,
+    measure_seed,
+)
 from matplotlib.axes import Axes
 from realisation_tables import Line, each_realisation
 
 from escape_hw.errors import CalibrationError
 from escape_hw.report.figures.style import SERIES, legend, new_figure, style_axes
 
-NAMES = (ESCAPE, DOCRIME)
+NAMES = (ESCAPE + GAINS, DOCRIME + GAINS, DOCRIME)
 
 
 def measure_or_refuse(options: argparse.Namespace, number: int, until: float) -> Line:
@@ -47,14 +55,15 @@ def _rms(values: list[float]) -> float:
 
 def print_table(tables: dict[float, list[Line]]) -> None:
     """Print a line per magnitude."""
-    print("| magnitude | ESCAPE | DO-CRIME alone | difference | converged | shift, rms error | stated |")
-    print("|---|---|---|---|---|---|---|")
+    print(f"| magnitude | {' | '.join(NAMES)} | first minus last | converged | shift, rms error | stated |")
+    print("|---" * (5 + len(NAMES)) + "|")
     for magnitude, rows in tables.items():
-        escape, docrime = (np.array([row["strehl"][name] for row in rows]) for name in NAMES)
+        values = [np.array([row["strehl"][name] for row in rows]) for name in NAMES]
         errors, sigmas = shift_errors(rows)
         print(
-            f"| {magnitude:g} | {escape.mean():.1f} | {docrime.mean():.1f} | {interval(escape - docrime)} | "
-            f"{len(errors) // 2} of {len(rows)} | {_rms(errors):.2g} | {_rms(sigmas):.2g} |"
+            f"| {magnitude:g} | {' | '.join(f'{one.mean():.1f}' for one in values)} | "
+            f"{interval(values[0] - values[-1])} | {len(errors) // 2} of {len(rows)} | {_rms(errors):.2g} | "
+            f"{_rms(sigmas):.2g} |"
         )
 
 
