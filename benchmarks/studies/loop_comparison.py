@@ -35,16 +35,18 @@ from numpy.typing import NDArray
 from realisation_tables import Line, append_line, each_realisation, read_lines, study_parser
 from scipy import stats
 
+from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.registration import PARAMETERS, UNITS
 from escape_hw.api.results import CalibrationResult
 from escape_hw.calibration.loop.performance import close_loop
 from escape_hw.calibration.loop.runner import minimum_strehl_frames
 from escape_hw.calibration.optical_gain.bootstrap import bootstrap_gains
-from escape_hw.calibration.optical_gain.matrix_comparison import scale_matrix
+from escape_hw.calibration.optical_gain.matrix_comparison import projector, scale_matrix, slope_weights
 from escape_hw.calibration.optical_gain.smoothing import clip_gains
 from escape_hw.calibration.sprint.synthetic_matrix import static_light_matrix
 from escape_hw.config.loader import load_system
 from escape_hw.config.sensor import PyramidSection
+from escape_hw.errors import CalibrationError
 from escape_hw.io.fits.matrix import load_matrix, save_matrix
 from escape_hw.io.provenance import get_git_state
 from escape_hw.runtime.session.record import BenchRecord
@@ -127,10 +129,23 @@ class SeedRun:
         print(f"seed {self.number}: {json.dumps(self._records[what])}", flush=True)
 
 
+def every_mode_is_measured(matrix: InteractionMatrix) -> bool:
+    """Whether every mode of a matrix is above its noise."""
+    try:
+        projector(matrix, slope_weights(matrix))
+    except CalibrationError:
+        return False
+    return True
+
+
 def scaled_by_optical_gains(seed: SeedRun, escape: CalibrationResult) -> dict[str, CalibrationResult]:
-    """ESCAPE's matrix and DO-CRIME's, each scaled by its optical gains as the bootstrap finds them."""
+    """ESCAPE's matrix and DO-CRIME's, each scaled by its optical gains as the bootstrap finds them.
+
+    Without DO-CRIME's where a mode of it is noise, so that it has no optical gain.
+    """
     options, measured = seed.options, escape.measured
     assert measured is not None
+    others = {DOCRIME: measured} if every_mode_is_measured(measured) else {}
 
     def rescaled_matrix(bench: System) -> CalibrationResult:
         get_simulated_bench(bench).advance_to(BOOTSTRAP_START_S)
@@ -140,7 +155,7 @@ def scaled_by_optical_gains(seed: SeedRun, escape: CalibrationResult) -> dict[st
                 escape,
                 frames=options.frames,
                 accuracy=options.accuracy,
-                comparisons={DOCRIME: measured},
+                comparisons=others,
                 closed_loop_matrix=static_light_matrix(bench, escape),
             )
         )
@@ -152,13 +167,15 @@ def scaled_by_optical_gains(seed: SeedRun, escape: CalibrationResult) -> dict[st
             "errors": [one.gains.common_sigma for one in result.rounds],
         }
         seed.add_record("bootstrap", found)
-        gains = result.comparisons[DOCRIME]
-        matrix = scale_matrix(measured, clip_gains(gains), gains.best_sigma)
-        seed.save_matrix("docrime-gains", replace(escape, matrix=matrix, measured=None), bench)
+        for gains in result.comparisons.values():
+            matrix = scale_matrix(measured, clip_gains(gains), gains.best_sigma)
+            seed.save_matrix("docrime-gains", replace(escape, matrix=matrix, measured=None), bench)
         return run.rescaled_calibration
 
-    scaled = seed.matrix("gains", rescaled_matrix)
-    return {ESCAPE + GAINS: scaled, DOCRIME + GAINS: seed.matrix("docrime-gains", rescaled_matrix)}
+    scaled = {ESCAPE + GAINS: seed.matrix("gains", rescaled_matrix)}
+    if others:
+        scaled[DOCRIME + GAINS] = seed.matrix("docrime-gains", rescaled_matrix)
+    return scaled
 
 
 def matrices(seed: SeedRun) -> dict[str, CalibrationResult]:
@@ -266,18 +283,18 @@ def interval(values: NDArray[np.float64]) -> str:
 
 def strehl_lines(rows: Sequence[Line]) -> list[str]:
     """Table of Strehl ratios by seed, and the differences paired by seed."""
-    names = list(rows[0]["strehl"])
+    names = [name for name in PAIRED if any(name in row["strehl"] for row in rows)]
     lines = ["| seed | " + " | ".join(names) + " |", "|---" * (1 + len(names)) + "|"]
     for row in rows:
-        cells = " | ".join(f"{row['strehl'][name]:.2f}" for name in names)
-        lines.append(f"| {row['realisation']} | {cells} |")
-    values = {name: np.array([row["strehl"][name] for row in rows]) for name in names}
-    lines += ["| mean | " + " | ".join(f"{values[name].mean():.2f}" for name in names) + " |", ""]
-    pairs = combinations([name for name in PAIRED if name in names], 2)
-    return lines + [
-        f"- {one} minus {other}: {interval(values[one] - values[other])} % of Strehl ratio"
-        for one, other in pairs
-    ]
+        cells = " | ".join(f"{row['strehl'].get(name, np.nan):.2f}" for name in names)
+        lines.append(f"| {row['realisation']} | {cells.replace('nan', '-')} |")
+    values = {name: np.array([row["strehl"].get(name, np.nan) for row in rows]) for name in names}
+    lines += ["| mean | " + " | ".join(f"{np.nanmean(values[name]):.2f}" for name in names) + " |", ""]
+    for one, other in combinations(names, 2):
+        difference = values[one] - values[other]
+        known = difference[np.isfinite(difference)]
+        lines.append(f"- {one} minus {other}, n = {known.size}: {interval(known)} % of Strehl ratio")
+    return lines
 
 
 def registration_lines(rows: Sequence[Line]) -> list[str]:

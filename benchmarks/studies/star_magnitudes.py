@@ -32,7 +32,7 @@ from realisation_tables import Line, each_realisation
 from escape_hw.errors import CalibrationError
 from escape_hw.report.figures.style import SERIES, legend, new_figure, style_axes
 
-NAMES = (ESCAPE + GAINS, DOCRIME + GAINS, DOCRIME)
+NAMES = (ESCAPE + GAINS, DOCRIME)
 
 
 def measure_or_refuse(options: argparse.Namespace, number: int, until: float) -> Line:
@@ -55,7 +55,7 @@ def _rms(values: list[float]) -> float:
 
 def print_table(tables: dict[float, list[Line]]) -> None:
     """Print a line per magnitude."""
-    print(f"| magnitude | {' | '.join(NAMES)} | first minus last | converged | shift, rms error | stated |")
+    print(f"| magnitude | {' | '.join(NAMES)} | difference | converged | shift, rms error | stated |")
     print("|---" * (5 + len(NAMES)) + "|")
     for magnitude, rows in tables.items():
         values = [np.array([row["strehl"][name] for row in rows]) for name in NAMES]
