@@ -154,3 +154,19 @@ def test_files_are_chosen_in_the_run_folder(
     window.replay.ask_product()
     window.replay.ask_run()
     assert folders == [str(runs)] * 3
+
+
+def test_the_buttons_follow_the_state_and_the_message_stays(
+    browser: RunBrowser, window: MainWindow, source: ScriptedSource, qtbot: QtBot
+) -> None:
+    click(browser, "escape-7")
+    holder = source.state.lease
+    source.change(lease=None)
+    window.update_timer.tick(force=True)
+    assert "take control first" in browser.load_button.toolTip()
+    source.change(lease=holder)
+    window.update_timer.tick(force=True)
+    QTest.mouseClick(browser.load_button, Qt.MouseButton.LeftButton)
+    qtbot.waitUntil(lambda: "Loaded as 'escape-7'" in browser.message.text())
+    window.update_timer.tick(force=True)
+    assert "Loaded as 'escape-7'" in browser.message.text()
