@@ -113,6 +113,9 @@ def test_a_front_that_was_killed_leaves_a_flat_mirror_and_a_note(system, bench, 
     with on_metal(system, server, tmp_path / ("long" * 20)) as served:
         with served.connect(control=True) as client:
             until_idle(client)
+            client.calibrate("docrime", frames=500)
+            products = client.state.products
+            assert [one.name for one in products if one.kind == "matrix"]
             run = client.start("docrime", frames=10_000_000)
             wait_for(lambda: bool(list(tmp_path.rglob("run.state"))) and not spy.flat, "the mirror is poked")
             front, engine = served.front, client.state.engine_pid
@@ -124,6 +127,7 @@ def test_a_front_that_was_killed_leaves_a_flat_mirror_and_a_note(system, bench, 
             until_idle(client)
             assert spy.flat
             assert client.state.active_run is None
+            assert client.state.products == products, "the matrices are offered again"
             with pytest.raises(CalibrationError, match="ended with its engine: the previous server"):
                 run.wait(60)
             client.acquire()

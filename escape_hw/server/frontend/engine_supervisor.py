@@ -164,6 +164,7 @@ class EngineSupervisor:
     def _handle_message(self, message: dict[str, Any]) -> None:
         if "state" in message:
             self._published.update(State.model_validate(message["state"]))
+            self._journal.write_products(self._published.state.products)
             violation = self._watchdog.check(self._published.state)
             if violation is not None:
                 self.make_safe(violation.reason, violation.remedy)
