@@ -38,6 +38,7 @@ def test_the_fail_safe_process_flattens_the_mirror_of_a_killed_engine(system, be
         wait_for(lambda: guarded(client), "the fail-safe process has ended")
         assert spy.flat
         assert client.state.phase is Phase.FAULT
+        assert "offsets are zero" in client.state.fault.remedy
         assert not segments(pid=running)
         whole(tmp_path)
         # The accumulators were kept, and the next engine continues with them.
@@ -146,6 +147,7 @@ def test_a_front_that_was_killed_leaves_a_flat_mirror_and_a_note(system, bench, 
         with served.connect() as client:
             notes = " / ".join(client.state.notes)
         assert "did not end cleanly" in notes
+        assert "offsets are zero" in notes
         assert "docrime" in notes
         assert str(partial.parent) in notes
 

@@ -20,6 +20,11 @@ from escape_hw.streams.segments import remove_orphaned
 from escape_hw.supervision import is_alive, process_start
 
 log = logging.getLogger(__name__)
+#: What an engine does not know of the one before.
+RESET = (
+    "gain, leak and camera settings are those of the system file again, offsets are zero, and a measured "
+    "dark frame or flat has to be measured again"
+)
 
 
 def server_folder() -> Path:
@@ -80,7 +85,7 @@ class ServerJournal:
             self.last_run_id = int(stale.get("last_run_id", 0))
             with contextlib.suppress(TypeError, ValidationError):
                 self.products = tuple(ProductEntry.model_validate(one) for one in stale.get("products", ()))
-            notes.append(f"the previous server (process {stale.get('pid')}) did not end cleanly")
+            notes.append(f"the previous server (process {stale.get('pid')}) did not end cleanly; {RESET}")
             if (run := stale.get("run")) is not None:
                 notes.append(_describe_run(run))
         for path in sorted(self.folder.glob(f"{self.system}-*.incident.json")):
