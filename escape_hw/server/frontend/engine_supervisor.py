@@ -164,10 +164,11 @@ class EngineSupervisor:
     def _handle_message(self, message: dict[str, Any]) -> None:
         if "state" in message:
             self._published.update(State.model_validate(message["state"]))
-            self._journal.write_products(self._published.state.products)
             violation = self._watchdog.check(self._published.state)
             if violation is not None:
                 self.make_safe(violation.reason, violation.remedy)
+            # Last: a full disk is an error.
+            self._journal.write_products(self._published.state.products)
             return
         self._on_message(message)
         if "run" in message:
