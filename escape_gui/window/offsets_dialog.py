@@ -11,7 +11,7 @@ from escape_gui.client.availability import reason_no_start
 from escape_gui.client.session import Session
 from escape_gui.theme import Theme
 from escape_gui.widgets.controls import caption, column, row, set_available, text_label
-from escape_gui.widgets.inputs import NumberBox
+from escape_gui.widgets.inputs import NumberBox, ignore_wheel_without_focus
 from escape_hw.remote.client import Connection
 from escape_hw.remote.state import OffsetsState
 
@@ -55,6 +55,7 @@ class OffsetsDialog(QDialog):
         self.references, self.flat = caption(), caption()
         self.saved, self.name = QComboBox(), QLineEdit()
         self.saved.setAccessibleName("Saved offsets")
+        ignore_wheel_without_focus(self.saved)
         self.name.setPlaceholderText("name")
         self.name.setAccessibleName("Name under which the offsets are saved")
         self.name.textEdited.connect(lambda _: self.update_buttons())
