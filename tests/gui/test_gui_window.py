@@ -40,6 +40,7 @@ from escape_hw.remote.state import (
     Phase,
     ProcedureEntry,
     ProcedureParameter,
+    RecordingState,
 )
 from escape_hw.server.engine.procedures import ProcedureRegistry
 
@@ -527,3 +528,15 @@ def test_no_error_makes_room_for_information(
     ]  # fmt: skip
     qtbot.waitUntil(lambda: len(notifications.notifications) == 2, timeout=60_000)
     assert notifications.notifications[1].text.splitlines() == list(source.state.notes)
+
+
+def test_a_recording_that_fails_is_notified(small_window: MainWindow, source: ScriptedSource) -> None:
+    source.change(recording=RecordingState(recording=True, path="/runs/1"))
+    small_window.update_timer.tick(force=True)
+    full = RecordingState(path="/runs/1", fault="94 MB free, below the limit of 268 MB; free some space")
+    for _ in range(2):
+        source.change(recording=full)
+        small_window.update_timer.tick(force=True)
+    (told,) = small_window.notifications.notifications
+    assert (told.level, told.title) == (Level.ERROR, "Recording ended")
+    assert told.text.startswith(full.fault)
