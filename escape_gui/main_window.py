@@ -436,8 +436,10 @@ class MainWindow(QMainWindow):
             action.setEnabled(not reason)
             keys = f" ({format_shortcuts(one.keys)})" if one.keys and not reason else ""
             action.setToolTip(tooltip(f"{one.tip}{keys}", reason))
-        dialogs = (self.offsets_dialog, self.run_browser, self.recording_browser)
-        for dialog in (*self.camera_dialogs.values(), *dialogs):
+        dialogs: tuple[CameraDialog | OffsetsDialog | RunBrowser | RecordingBrowser, ...] = (
+            *self.camera_dialogs.values(), self.offsets_dialog, self.run_browser, self.recording_browser,
+        )  # fmt: skip
+        for dialog in dialogs:
             if dialog.isVisible():
                 dialog.update_buttons()
         for dock in self.docks.values():

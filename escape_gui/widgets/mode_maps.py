@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -147,8 +146,7 @@ class MapTiles(QWidget):
         for number, (holder, labels, image) in enumerate(self._tile_widgets):
             holder.setVisible(number < len(self.tiles))
             if number < len(self.tiles):
-                lines = _title_lines(self.tiles[number])
-                for label, line in itertools.zip_longest(labels, lines, fillvalue=_EMPTY_LINE):
+                for label, line in zip(labels, _title_lines(self.tiles[number]), strict=True):
                     label.show_text(line)
                 image.show_tile(self.tiles[number])
         self._arrange()
@@ -172,10 +170,11 @@ class MapTiles(QWidget):
 
 
 def _title_lines(tile: MapTile) -> list[str]:
-    """Title, numbers and colour scale of a tile, at most :data:`_TITLE_LINES` lines."""
+    """Title, numbers and colour scale of a tile, :data:`_TITLE_LINES` lines."""
     low, high = tile.limits
     scale = f"±{high:g}" if tile.signed else f"{low:g} to {high:g}"
-    return [tile.title, *tile.note.split(", ", maxsplit=1), f"colours {scale}"]
+    lines = [tile.title, *tile.note.split(", ", maxsplit=1), f"colours {scale}"]
+    return lines + (_TITLE_LINES - len(lines)) * [_EMPTY_LINE]
 
 
 #: Minimum width of a mode's pair of maps at font scale 1, pixels.

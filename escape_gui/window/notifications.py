@@ -154,8 +154,8 @@ class StateNotifier:
             return
         if state.fault is not None and state.fault != before.fault:
             self._bar.show_message(Level.ERROR, _FAULT, state.fault.reason)
-        recording, last = state.recording, before.recording
-        if recording.fault and (recording.fault, recording.path) != (last.fault, last.path):
+        recording, earlier = state.recording, before.recording
+        if recording.fault and (recording.fault, recording.path) != (earlier.fault, earlier.path):
             self._bar.show_message(Level.ERROR, "Recording ended", f"{recording.fault}\n{recording.path}")
         if state.last_run is not None and state.last_run != before.last_run:
             last = state.last_run
