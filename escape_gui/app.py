@@ -19,7 +19,7 @@ from PySide6.QtWidgets import QApplication
 from escape_gui.client.connection import LiveSource, LocalServer, ServerAttachment
 from escape_gui.client.session import EmptySource, Session
 from escape_gui.main_window import MainWindow
-from escape_gui.replay.playback import is_recording
+from escape_gui.replay.playback import is_recording, read_run
 from escape_gui.replay.source import ReplaySource
 from escape_gui.settings import Settings, load_settings, settings_file
 from escape_gui.widgets.controls import Level
@@ -245,7 +245,7 @@ def run(system: str, address: str, screenshot: Path | None, reset_settings: bool
         window, session, address, local_server, lambda name: starter.submit(LocalServer, name).result()
     )
     if recording:
-        window.show_recording(ReplaySource(system))
+        window.show_recording(read_run(Path(system)))
     window.update_timer.start()
     if screenshot is None:
         window.fit_to_screen(window.screen().availableGeometry())

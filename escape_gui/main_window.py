@@ -436,11 +436,12 @@ class MainWindow(QMainWindow):
             action.setEnabled(not reason)
             keys = f" ({format_shortcuts(one.keys)})" if one.keys and not reason else ""
             action.setToolTip(tooltip(f"{one.tip}{keys}", reason))
-        for dialog in self.camera_dialogs.values():
+        dialogs: tuple[CameraDialog | OffsetsDialog | RunBrowser | RecordingBrowser, ...] = (
+            *self.camera_dialogs.values(), self.offsets_dialog, self.run_browser, self.recording_browser,
+        )  # fmt: skip
+        for dialog in dialogs:
             if dialog.isVisible():
                 dialog.update_buttons()
-        if self.offsets_dialog.isVisible():
-            self.offsets_dialog.update_buttons()
         for dock in self.docks.values():
             dock.show_health()
         self.state_notifier.update(state, connected=now.connected, mine=now.may_write)

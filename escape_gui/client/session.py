@@ -101,7 +101,7 @@ class Session(QObject):
         urgent: bool = False,
         quiet: bool = False,
     ) -> None:
-        """Send a request; returns at once, and does nothing without a server.
+        """Send a request; returns at once. Without a server it fails.
 
         Parameters
         ----------
@@ -117,7 +117,15 @@ class Session(QObject):
             Do not emit :attr:`failed`: ``on_error`` reports the failure.
         """
         control = self.control
+
+        def fail(reason: str) -> None:
+            if not quiet:
+                self.failed.emit(what, reason)
+            if on_error is not None:
+                on_error(reason)
+
         if control is None:
+            fail("there is no server")
             return
 
         def deliver(future: Future[T]) -> None:
@@ -136,11 +144,7 @@ class Session(QObject):
                 return
             if not isinstance(error, EscapeError):
                 log.error("%s failed unexpectedly", what, exc_info=error)
-            reason = str(error) or type(error).__name__
-            if not quiet:
-                self.failed.emit(what, reason)
-            if on_error is not None:
-                on_error(reason)
+            fail(str(error) or type(error).__name__)
 
         self._set_pending(self._pending + 1)
         if urgent not in self._executors:

@@ -11,6 +11,7 @@ from PySide6.QtWidgets import QComboBox, QLineEdit, QPushButton
 
 from escape_gui.panels.base import Context, Panel
 from escape_gui.widgets.controls import LogText, row
+from escape_gui.widgets.inputs import ignore_wheel_without_focus
 from escape_hw.io.provenance import format_local_time
 from escape_hw.remote.source import DataSource
 from escape_hw.remote.state import LogLine
@@ -39,6 +40,7 @@ class LogPanel(Panel):
         self.search.setAccessibleName("Search the log")
         self.search.textChanged.connect(self._refilter)
         self.level = QComboBox()
+        ignore_wheel_without_focus(self.level)
         self.level.addItems([level.title() for level in LEVELS])
         self.level.setCurrentIndex(1)
         self.level.setAccessibleName("Minimum level")

@@ -248,7 +248,7 @@ class LoopPanel(Panel):
             # The button is disabled next, and would pass its focus on to Revert.
             self.check_button.setFocus()
             done = f"Applied: {self._checked_edit.describe_changes(self._loop)}"
-            self._ask("change the loop", lambda server: server.set_loop(**changed), done)
+            self._ask("change the loop", lambda server: server.set_loop(**changed), self._checked_edit, done)
 
     def close_loop(self) -> None:
         """Close the loop with the values of the form, all of which are current or checked."""
@@ -258,17 +258,24 @@ class LoopPanel(Panel):
         self._ask(
             "close the loop",
             lambda server: server.close_loop(edit.matrix, edit.gain or None, edit.leak, edit.dropped_modes),
+            edit,
             f"Loop closed with {edit.describe()}",
         )
 
-    def _ask(self, what: str, call: Callable[[Connection], object], done: str) -> None:
+    def _ask(
+        self, what: str, call: Callable[[Connection], object], sent: LoopSettingsEdit, done: str
+    ) -> None:
         if self.context.session.control is not None:
             self._show_message("Waiting for the server…")
-            self.context.session.ask(what, call, lambda _: self._on_done(done), self._on_refused)
+            self.context.session.ask(what, call, lambda _: self._on_done(sent, done), self._on_refused)
 
-    def _on_done(self, done: str) -> None:
-        self._forget_edits()
-        self._show_message(done)
+    def _on_done(self, sent: LoopSettingsEdit, done: str) -> None:
+        """Show the result; what was edited while the server worked stays."""
+        now = self.edit
+        self._edited = {name for name in self._edited if getattr(now, name) != getattr(sent, name)}
+        if not self._edited:
+            self._checked_edit = None
+        self._show_message(f"{done}. Edited since; press Check." if self._edited else done)
 
     def _on_refused(self, reason: str) -> None:
         self._checked_edit = None

@@ -11,12 +11,13 @@ from typing import ClassVar
 
 from PySide6.QtWidgets import QComboBox, QFileDialog, QLineEdit, QPushButton
 
+from escape_gui.client.availability import reason_no_request
 from escape_gui.client.session import runs_folder
 from escape_gui.panels.base import Context, Panel
 from escape_gui.widgets.controls import LogText, row, set_available, text_label
+from escape_gui.widgets.inputs import ignore_wheel_without_focus
 from escape_hw.io.night_log import MAX_TEXT, NightEntry, night_of
 from escape_hw.remote.source import DataSource
-from escape_hw.remote.state import State
 
 #: Entries shown; the file in the run folder has all of them.
 MAX_ENTRIES = 5000
@@ -52,6 +53,7 @@ class NightPanel(Panel):
         self.add_button = QPushButton("Add")
         self.add_button.clicked.connect(self.add_note)
         self.filter = QComboBox()
+        ignore_wheel_without_focus(self.filter)
         self.filter.addItems(list(FILTERS))
         self.filter.setAccessibleName("Entries to show")
         self.filter.currentIndexChanged.connect(self._refilter)
@@ -74,7 +76,7 @@ class NightPanel(Panel):
     def add_note(self) -> None:
         """Send the note; the field is cleared when the server has it."""
         text = self.note.text().strip()
-        if text and self.add_button.isEnabled():
+        if text and self.note.isEnabled():
             self.note.setEnabled(False)
             self.context.session.ask(
                 "add the note", lambda server: server.add_note(text), self._on_added, self._on_refused
@@ -90,12 +92,9 @@ class NightPanel(Panel):
         self._show_message(f"The note is not in the log: {reason}")
 
     # ------------------------------------------------------------ entries
-    def on_state(self, state: State) -> None:
-        session = self.context.session
-        reason = "" if session.control is not None and session.source.connected else "there is no server"
-        set_available(self.add_button, "Add the note to the log (Enter)", reason)
-
     def tick(self, source: DataSource) -> None:
+        reason = reason_no_request(self.context.session.request_context)
+        set_available(self.add_button, "Add the note to the log (Enter).", reason)
         new = source.night_after(self._number)
         if new:
             self._number = new[-1].number

@@ -27,6 +27,7 @@ from escape_gui.views.telemetry import (
 )
 from escape_gui.widgets.browser_table import SortableCell, browser_table
 from escape_gui.widgets.controls import SegmentedButton, caption, row, set_available, text_label
+from escape_gui.widgets.inputs import ignore_wheel_without_focus
 from escape_gui.widgets.telemetry_plot import GainByModePlot, ResidualPlot, SpectraPlot
 from escape_hw.remote.source import DataSource
 from escape_hw.remote.state import RecordingState, State
@@ -81,10 +82,12 @@ class TelemetryPanel(Panel):
         for widget in (self.residual, self.spectra, self.gains, self.table):
             self.stack.addWidget(widget)
         self.kind = QComboBox()
+        ignore_wheel_without_focus(self.kind)
         self.kind.addItems(SPECTRA)
         self.kind.setAccessibleName("Spectra to show")
         self.kind.currentIndexChanged.connect(self._on_view_chosen)
         self.mode = QSpinBox()
+        ignore_wheel_without_focus(self.mode)
         self.mode.setRange(1, 1)
         self.mode.setAccessibleName("Mode of the spectra")
         self.mode.valueChanged.connect(self.redraw)
@@ -107,6 +110,7 @@ class TelemetryPanel(Panel):
         self.record_button = QPushButton("Record")
         self.record_button.clicked.connect(self._toggle_recording)
         self.seconds = QSpinBox()
+        ignore_wheel_without_focus(self.seconds)
         self.seconds.setRange(0, 36_000)
         self.seconds.setValue(10)
         self.seconds.setSuffix(" s")
@@ -132,8 +136,6 @@ class TelemetryPanel(Panel):
         recording = self._recorded = state.recording
         on = recording.recording
         self.record_button.setText("Stop" if on else "Record")
-        tip = "Stop the recording" if on else "Record slopes, residuals and commands at full rate"
-        set_available(self.record_button, tip, reason_no_change(self.context.session.request_context))
         for widget in (self.seconds, self.images):
             widget.setEnabled(not on)
         self.growth.setText(("● " if on else "") + describe_growth(recording, _age_s(recording.started_utc)))
@@ -212,6 +214,10 @@ class TelemetryPanel(Panel):
                 self.table.setItem(line, column, SortableCell(text, text))
 
     def tick(self, source: DataSource) -> None:
+        # Here: a server that is lost sends no state.
+        on = self._recorded.recording
+        tip = "Stop the recording." if on else "Record slopes, residuals and commands at full rate."
+        set_available(self.record_button, tip, reason_no_change(self.context.session.request_context))
         if not source.connected:
             self.growth.clear()
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
@@ -11,7 +12,9 @@ from PySide6.QtWidgets import QFileDialog, QLabel, QSlider, QToolBar, QToolButto
 
 from escape_gui.client.session import Session, runs_folder
 from escape_gui.replay.source import ReplaySource
-from escape_hw.errors import EscapeError
+from escape_hw.errors import EscapeError, ProductError
+
+log = logging.getLogger(__name__)
 
 
 class RecordingOpener(QObject):
@@ -49,7 +52,7 @@ class RecordingOpener(QObject):
 
     def open(self, path: Path) -> None:
         """Start to read a product or a run folder; returns at once."""
-        self._pool.submit(ReplaySource, path).add_done_callback(self._read.emit)
+        self._pool.submit(read_run, path).add_done_callback(self._read.emit)
 
     def _on_read(self, future: Future[ReplaySource]) -> None:
         try:
@@ -69,6 +72,20 @@ class RecordingOpener(QObject):
 
     def close(self) -> None:
         self._pool.shutdown(wait=True, cancel_futures=True)
+
+
+def read_run(path: Path) -> ReplaySource:
+    """Read a product or a run folder; EscapeError: it cannot be read, or is damaged."""
+    try:
+        return ReplaySource(path)
+    except EscapeError:
+        raise
+    except Exception as error:
+        log.error("%s cannot be replayed", path, exc_info=error)
+        reason = f"{type(error).__name__}: {error}"
+        raise ProductError(
+            f"{path}: its document is damaged ({reason}); open its products one by one"
+        ) from None
 
 
 def is_recording(path: Path) -> bool:

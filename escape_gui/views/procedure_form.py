@@ -77,7 +77,8 @@ def parse_value(parameter: ProcedureParameter, text: str) -> float | int | str |
     try:
         number = float(text)
     except ValueError:
-        raise ValueError(f"{label(parameter)}: '{text}' is no number") from None
+        hint = "; write a decimal point, and no other separators" if "," in text else ""
+        raise ValueError(f"{label(parameter)}: '{text}' is no number{hint}") from None
     low = -math.inf if parameter.low is None else parameter.low
     high = math.inf if parameter.high is None else parameter.high
     if not (math.isfinite(number) and low <= number <= high):

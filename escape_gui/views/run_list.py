@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 from escape_hw.errors import ProductError
-from escape_hw.io.run_folder import find_runs, read_result, run_label, run_time
+from escape_hw.io.run_folder import RESULT_FILE, find_runs, read_result, run_label, run_time
 from escape_hw.report.tables import METHOD_LABELS
 from escape_hw.report.verdict import Quality, assess
 
-log = logging.getLogger(__name__)
 #: Products with a matrix, in the order of preference; ``im`` is the one to close the loop with.
 _MATRICES = ("im", "escape", "docrime")
 COLUMNS = ("Date", "Run", "System", "Method", "Frames", "Quality", "Size")
@@ -50,14 +48,25 @@ class RunSummary:
 
 
 def read_runs(runs: Path) -> Iterator[RunSummary]:
-    """The finished runs under a folder, the newest first; a damaged one is left out, and logged."""
+    """The finished runs under a folder, the newest first; a damaged one says so in its verdict."""
     for folder in find_runs(runs):
+        if not (folder / RESULT_FILE).is_file():
+            continue
         try:
             yield _summarise(folder)
         except (ProductError, OSError) as error:
-            log.info("run not listed: %s", error)
+            yield _damaged(folder, str(error))
         except (TypeError, ValueError, OverflowError) as error:
-            log.info("run not listed: %s: its document is damaged (%s)", folder, error)
+            yield _damaged(folder, f"its document is damaged ({error})")
+
+
+def _damaged(folder: Path, why: str) -> RunSummary:
+    """A run whose document cannot be read; its files can be opened one by one."""
+    return RunSummary(
+        folder=folder, date=f"{folder.parent.name} {run_time(folder)}", name=run_label(folder), system="",
+        method="damaged", frames=0, quality=None, verdict=f"Damaged: {why}. Load its matrix as a file.",
+        size_mb=0.0, matrix=None, simulated=False,
+    )  # fmt: skip
 
 
 def _summarise(folder: Path) -> RunSummary:

@@ -11,12 +11,12 @@ import pyqtgraph as pg
 from numpy.typing import NDArray
 from PySide6.QtCore import QPointF, QRect, QSize, Qt, Signal
 from PySide6.QtGui import QFontMetricsF, QImage, QKeyEvent, QPainter, QPaintEvent, QResizeEvent
-from PySide6.QtWidgets import QGridLayout, QLabel, QSizePolicy, QWidget
+from PySide6.QtWidgets import QGridLayout, QSizePolicy, QWidget
 
 from escape_gui.theme import Theme
 from escape_gui.views import mode_maps as mode_views
 from escape_gui.views.mode_maps import MapTile, ModeStatistics, MosaicLayout, colour_indices
-from escape_gui.widgets.controls import column
+from escape_gui.widgets.controls import ElidedLabel, column
 from escape_gui.widgets.plots import reparent_menu, style_axis
 
 #: Colour maps for signed values and for magnitudes, suitable for any colour vision.
@@ -64,8 +64,10 @@ class ColourScale(QWidget):
         self.setFixedWidth(self._theme.pixels(64))
 
 
-#: Height of a line of a title at font scale 1, pixels.
-_LINE = 14
+#: Height of a line of a title at font scale 1, pixels, and lines of a title.
+_LINE, _TITLE_LINES = 15, 4
+#: Keeps the height of a line.
+_EMPTY_LINE = "\N{NO-BREAK SPACE}"
 
 
 def best_columns(count: int, width: float, height: float, title: float) -> int:
@@ -119,7 +121,7 @@ class MapTiles(QWidget):
         super().__init__()
         self._theme, self._columns = theme, 2
         self.tiles: tuple[MapTile, ...] = ()
-        self._tile_widgets: list[tuple[QWidget, QLabel, MapImage]] = []
+        self._tile_widgets: list[tuple[QWidget, list[ElidedLabel], MapImage]] = []
         self._grid = QGridLayout(self)
         self._grid.setContentsMargins(4, 4, 4, 4)
         self._grid.setSpacing(8)
@@ -130,7 +132,7 @@ class MapTiles(QWidget):
         self._arrange()
 
     def _arrange(self) -> None:
-        title = 4 * self._theme.pixels(_LINE)
+        title = _TITLE_LINES * self._theme.pixels(_LINE)
         columns = best_columns(len(self.tiles), self.width(), self.height(), title)
         if columns != self._columns:
             self._columns = columns
@@ -141,33 +143,38 @@ class MapTiles(QWidget):
         self.tiles = tuple(tiles)
         while len(self._tile_widgets) < len(self.tiles):
             self._add_tile_widget()
-        for number, (holder, title, image) in enumerate(self._tile_widgets):
+        for number, (holder, labels, image) in enumerate(self._tile_widgets):
             holder.setVisible(number < len(self.tiles))
             if number < len(self.tiles):
-                title.setText(self._title(self.tiles[number]))
+                for label, line in zip(labels, _title_lines(self.tiles[number]), strict=True):
+                    label.show_text(line)
                 image.show_tile(self.tiles[number])
         self._arrange()
 
     def _add_tile_widget(self) -> None:
-        holder, title, image = QWidget(), QLabel(), MapImage()
-        title.setWordWrap(True)
-        title.setFont(self._theme.font(0.9))
-        # Titles wrap, so that all columns have the same width.
-        title.setSizePolicy(QSizePolicy.Policy.Ignored, QSizePolicy.Policy.Minimum)
-        column(title, (image, 1), parent=holder, spacing=2)
+        holder, labels, image = QWidget(), [ElidedLabel() for _ in range(_TITLE_LINES)], MapImage()
+        column(*labels, (image, 1), parent=holder, spacing=0)
         self._grid.addWidget(holder, *divmod(len(self._tile_widgets), self._columns))
-        self._tile_widgets.append((holder, title, image))
+        self._tile_widgets.append((holder, labels, image))
+        self._apply_fonts(labels)
 
-    def _title(self, tile: MapTile) -> str:
-        low, high = tile.limits
-        scale = f"±{high:g}" if tile.signed else f"{low:g} to {high:g}"
-        muted = self._theme.colours.muted
-        return f"<b>{tile.title}</b><br><span style='color:{muted}'>{tile.note}<br>colours {scale}</span>"
+    def _apply_fonts(self, labels: list[ElidedLabel]) -> None:
+        for k, label in enumerate(labels):
+            label.setFont(self._theme.font(0.9, bold=k == 0))
+            label.setStyleSheet(f"color: {self._theme.colours.muted};" if k else "")
 
     def apply_theme(self) -> None:
-        for _, title, _ in self._tile_widgets:
-            title.setFont(self._theme.font(0.9))
+        for _, labels, _ in self._tile_widgets:
+            self._apply_fonts(labels)
         self.show_tiles(self.tiles)
+
+
+def _title_lines(tile: MapTile) -> list[str]:
+    """Title, numbers and colour scale of a tile, :data:`_TITLE_LINES` lines."""
+    low, high = tile.limits
+    scale = f"±{high:g}" if tile.signed else f"{low:g} to {high:g}"
+    lines = [tile.title, *tile.note.split(", ", maxsplit=1), f"colours {scale}"]
+    return lines + (_TITLE_LINES - len(lines)) * [_EMPTY_LINE]
 
 
 #: Minimum width of a mode's pair of maps at font scale 1, pixels.

@@ -36,7 +36,8 @@ class AlarmDialog(QDialog):
         buttons.accepted.connect(self._apply)
         buttons.rejected.connect(self.reject)
         note = QLabel(
-            "An alarm is raised after a second beyond its limit, and stays until it is acknowledged."
+            "An alarm is raised after a second beyond its limit, and stays until it is acknowledged. "
+            "A quantity that is not measured raises none."
         )
         note.setWordWrap(True)
         column(note, grid, self.muted, self.message, buttons, parent=self).setContentsMargins(16, 16, 16, 16)

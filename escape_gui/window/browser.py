@@ -80,8 +80,17 @@ class FolderBrowser(QDialog, Generic[T]):
         return ""
 
     @abc.abstractmethod
+    def update_buttons(self) -> None:
+        """Enable what is possible now; called by the window while the dialog is visible."""
+
+    @abc.abstractmethod
+    def _describe_selection(self) -> str:
+        """The line below the table."""
+
     def _enable(self) -> None:
         """Enable the buttons that apply to the selection, and describe it."""
+        self.update_buttons()
+        self.message.setText(self._describe_selection())
 
     # ------------------------------------------------------------ list
     def open_list(self) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 from PySide6.QtWidgets import QCheckBox, QDialog, QGridLayout, QPushButton, QWidget
@@ -37,7 +38,12 @@ class CameraDialog(QDialog):
         super().__init__(window)
         self._session, self._theme, self.camera = session, theme, camera
         self.setWindowTitle(f"{TITLES[camera]}: settings")
+        #: Settings of the camera, once they were read from the engine that runs now.
         self._current: CameraValues | None = None
+        #: Engine, and its phase, from which they were requested last.
+        self._engine_pid, self._requested_in = 0, Phase.STARTING
+        #: Fields that were edited since they were applied.
+        self._edited: set[str] = set()
         self._checked: dict[str, Any] = {}
         grid = QGridLayout()
         grid.setHorizontalSpacing(12)
@@ -48,7 +54,7 @@ class CameraDialog(QDialog):
         for line, (name, (label, unit, _, low, high, step, decimals)) in enumerate(_FIELDS.items(), 1):
             field = self.fields[name] = NumberBox(low, high, step=step, decimals=decimals)
             field.setAccessibleName(f"{label} setpoint")
-            field.edited.connect(self._on_edit)
+            field.edited.connect(partial(self._on_edit, name))
             field.lineEdit().returnPressed.connect(self.check)
             for place, widget in enumerate((caption(label), self.current[name], field, caption(unit))):
                 grid.addWidget(widget, line, place)
@@ -74,7 +80,8 @@ class CameraDialog(QDialog):
 
     def open_settings(self) -> None:
         """Show the dialog with the present settings."""
-        self._show_message("Reading the settings…")
+        self._current = None
+        self._edited.clear()
         self._request_current()
         self.show()
         self.raise_()
@@ -82,6 +89,9 @@ class CameraDialog(QDialog):
         self.update_buttons()
 
     def _request_current(self, then: str = "") -> None:
+        state = self._session.source.state
+        self._engine_pid, self._requested_in = state.engine_pid, state.phase
+        self._show_message(then or "Reading the settings…")
         self._session.ask(
             "read the camera's settings", lambda server: server.check_camera(self.camera),
             lambda plan: self._show_current(plan, then), self._on_error, quiet=True,
@@ -91,20 +101,28 @@ class CameraDialog(QDialog):
         self._current = plan.current
         for name, text in _texts(plan.current).items():
             self.current[name].setText(text)
-        self.revert()
+        self._follow()
         self._show_message(message or plan.refusal)
+        self.update_buttons()
 
     # ------------------------------------------------------------ edit, check, apply
     def revert(self) -> None:
         """Put the current settings into the fields."""
-        if self._current is not None:
-            for name, value in _values(self._current).items():
-                self.fields[name].setValue(value)
-        self._checked = {}
+        self._edited.clear()
+        self._follow()
         self._show_message("")
         self.update_buttons()
 
-    def _on_edit(self) -> None:
+    def _follow(self) -> None:
+        """Show the current settings in the fields that were not edited."""
+        self._checked = {}
+        if self._current is not None:
+            for name, value in _values(self._current).items():
+                if name not in self._edited:
+                    self.fields[name].setValue(value)
+
+    def _on_edit(self, name: str) -> None:
+        self._edited.add(name)
         self._checked = {}
         self._show_message("")
         self.update_buttons()
@@ -128,6 +146,8 @@ class CameraDialog(QDialog):
 
     def check(self) -> None:
         """Ask the server what the edited settings would change."""
+        if self._current is None:
+            return
         for name, field in self.fields.items():
             if not field.low <= field.value() <= field.high:
                 label = _FIELDS[name][0]
@@ -160,9 +180,13 @@ class CameraDialog(QDialog):
             self._show_message("Waiting for the camera…")
             self._session.ask(
                 "change the camera", lambda server: server.set_camera(self.camera, **wanted),
-                lambda plan: self._request_current(f"Applied: {', '.join(plan.changes)}"), self._on_error,
-                quiet=True,
+                lambda plan: self._on_applied(plan, wanted), self._on_error, quiet=True,
             )  # fmt: skip
+
+    def _on_applied(self, plan: CameraPlan, wanted: dict[str, Any]) -> None:
+        if self.changed() == wanted:
+            self._edited.clear()
+        self._request_current(f"Applied: {', '.join(plan.changes)}")
 
     def _measure_dark(self) -> None:
         by_hand = self.blocked.isChecked()
@@ -182,9 +206,19 @@ class CameraDialog(QDialog):
     def update_buttons(self) -> None:
         """Enable what is possible now; called by the window while the dialog is visible."""
         now = self._session.request_context
+        state = now.state
+        if state.engine_pid != self._engine_pid:
+            self._current = None  # of another engine
+        if self._current is None and (state.engine_pid, state.phase) != (
+            self._engine_pid, self._requested_in,
+        ):  # fmt: skip
+            self._request_current()
+        unread = "the settings were not read yet" if self._current is None else ""
         unchecked = "" if self._checked else "press Check first"
         set_available(
-            self.check_button, "Ask the camera what it can do; nothing changes.", reason_no_engine(now)
+            self.check_button,
+            "Ask the camera what it can do; nothing changes.",
+            reason_no_engine(now) or unread,
         )
         set_available(self.apply_button, "Apply the checked settings.", reason_no_change(now) or unchecked)
         idle = "" if now.state.phase is Phase.IDLE else "the bench is not idle"

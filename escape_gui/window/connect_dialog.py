@@ -17,6 +17,7 @@ from PySide6.QtWidgets import (
 
 from escape_gui.theme import Theme
 from escape_gui.widgets.controls import caption, column, row, set_available, text_label
+from escape_gui.widgets.inputs import ignore_wheel_without_focus
 from escape_hw.config.bundled import bundled_systems
 from escape_hw.config.loader import load_system
 from escape_hw.errors import EscapeError
@@ -53,6 +54,7 @@ class ConnectDialog(QDialog):
         self.address_button, self.make_key_button = QPushButton("Connect"), QPushButton("Make a key")
         self.own_key = text_label()
         self.system = QComboBox()
+        ignore_wheel_without_focus(self.system)
         self.system.setAccessibleName("System to serve")
         self.system.addItems(bundled_systems())
         self.system.setCurrentText("razor-shwfs")

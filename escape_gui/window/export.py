@@ -102,7 +102,7 @@ class Exporter:
         """Ask for a path and save a panel, if one has the focus, as ``png``, ``csv`` or ``fits``."""
         if panel is None:
             why = "Click a panel first, or use the ⤓ in its title."
-            self._notifications.show_message(Level.WARNING, "Which panel?", why)
+            self._notifications.show_message(Level.NEUTRAL, "Which panel?", why)
         elif path := self._ask_path(panel.name, kind):
             self.save_panel_to(path, kind, panel)
 

@@ -12,9 +12,11 @@ from escape_gui.widgets.controls import QUALITY_LEVELS, Level, StatusIndicator, 
 from escape_hw.remote.state import Finish, Lease, State
 from escape_hw.report.verdict import assess
 
-#: Display time of a notification; errors stay until they are closed.
+#: Display time of a notification.
 DISPLAY_MS = 6000
 _MAX_NOTIFICATIONS = 4
+#: Levels of notifications that stay until they are closed, the most important last.
+_STAYING = (Level.WARNING, Level.ERROR)
 
 
 class Notification(QFrame):
@@ -63,14 +65,17 @@ class NotificationBar(QWidget):
             self._remove(one)
 
     def show_message(self, level: Level, title: str, text: str) -> None:
-        """Show a notification for :data:`DISPLAY_MS`; an error until it is closed."""
+        """Show a notification for :data:`DISPLAY_MS`; a warning or an error until it is closed.
+
+        If there are too many, the oldest of those that matter least makes room.
+        """
         while len(self.notifications) >= _MAX_NOTIFICATIONS:
-            self._remove(self.notifications[0])
+            self._remove(min(self.notifications, key=lambda one: _importance(one.level)))
         new = Notification(self._theme, level, title, text)
         new.close_button.clicked.connect(lambda: self._remove(new))
         self.notifications.append(new)
         self._row.insertWidget(0, new, 1)
-        if level is not Level.ERROR:
+        if level not in _STAYING:
             timer = QTimer(new)
             timer.setSingleShot(True)
             timer.timeout.connect(lambda: self._remove(new))
@@ -93,8 +98,13 @@ class NotificationBar(QWidget):
         self._more.setToolTip("Older notifications" if others > 0 else "")
 
 
+def _importance(level: Level) -> int:
+    return _STAYING.index(level) if level in _STAYING else -1
+
+
 #: Titles of notifications that are closed when their reason has passed.
 _LOST, _FAULT, _TAKEN = "Server lost", "Fault, mirror made safe", "Control taken"
+_STARTUP = "Startup notice"
 _LEVELS = {Finish.DONE: Level.GOOD, Finish.ABORTED: Level.WARNING, Finish.FAILED: Level.ERROR}
 
 
@@ -137,12 +147,16 @@ class StateNotifier:
             self._bar.close_messages(_FAULT)
         # A front end that was restarted may have been away for less than what counts as disconnected.
         if before is None or not was_connected or state.notes != before.notes:
-            for notice in state.notes:
-                self._bar.show_message(Level.WARNING, "Startup notice", notice)
+            self._bar.close_messages(_STARTUP)
+            if state.notes:
+                self._bar.show_message(Level.WARNING, _STARTUP, "\n".join(state.notes))
         if before is None:
             return
         if state.fault is not None and state.fault != before.fault:
             self._bar.show_message(Level.ERROR, _FAULT, state.fault.reason)
+        recording, earlier = state.recording, before.recording
+        if recording.fault and (recording.fault, recording.path) != (earlier.fault, earlier.path):
+            self._bar.show_message(Level.ERROR, "Recording ended", f"{recording.fault}\n{recording.path}")
         if state.last_run is not None and state.last_run != before.last_run:
             last = state.last_run
             verdict = assess(last.document)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 from PySide6.QtWidgets import QComboBox, QDialog, QGridLayout, QLineEdit, QPushButton, QWidget
 
@@ -10,7 +11,7 @@ from escape_gui.client.availability import reason_no_start
 from escape_gui.client.session import Session
 from escape_gui.theme import Theme
 from escape_gui.widgets.controls import caption, column, row, set_available, text_label
-from escape_gui.widgets.inputs import NumberBox
+from escape_gui.widgets.inputs import NumberBox, ignore_wheel_without_focus
 from escape_hw.remote.client import Connection
 from escape_hw.remote.state import OffsetsState
 
@@ -40,6 +41,8 @@ class OffsetsDialog(QDialog):
         super().__init__(window)
         self._session, self._theme = session, theme
         self._shown: OffsetsState | None = None
+        #: Fields that were edited since they were applied.
+        self._edited: set[str] = set()
         self.setWindowTitle("Offsets of mirror and loop")
         self.fields = {
             name: NumberBox(-_LIMIT_NM, _LIMIT_NM, step=5, decimals=1) for name in (*TERMS, "mode")
@@ -52,6 +55,7 @@ class OffsetsDialog(QDialog):
         self.references, self.flat = caption(), caption()
         self.saved, self.name = QComboBox(), QLineEdit()
         self.saved.setAccessibleName("Saved offsets")
+        ignore_wheel_without_focus(self.saved)
         self.name.setPlaceholderText("name")
         self.name.setAccessibleName("Name under which the offsets are saved")
         self.name.textEdited.connect(lambda _: self.update_buttons())
@@ -87,6 +91,7 @@ class OffsetsDialog(QDialog):
             grid.addWidget(caption(text), 0, k)
         for line, (name, field) in enumerate(self.fields.items(), 1):
             field.setAccessibleName(f"{name} setpoint")
+            field.edited.connect(partial(self._edited.add, name))
             field.lineEdit().returnPressed.connect(self.apply)
             grid.addWidget(caption(name), line, 0)
             grid.addWidget(self.current[name], line, 2)
@@ -100,8 +105,8 @@ class OffsetsDialog(QDialog):
         self._show_message("")
         self._shown = None
         self.update_buttons()
-        for name, value in self._terms_now().items():
-            self.fields[name].setValue(value)
+        self._edited.clear()
+        self._follow()
         self.show()
         self.raise_()
         self.fields["tip"].setFocus()
@@ -128,29 +133,38 @@ class OffsetsDialog(QDialog):
     ) -> None:
         self._ask(
             "set the offsets", lambda server: server.set_offsets(terms, references=references, flat=flat),
-            "Applied.",
+            "Applied.", terms=terms is not None,
         )  # fmt: skip
 
     def _load(self) -> None:
         name = self.saved.currentText()
-        self._ask("restore the offsets", lambda server: server.load_offsets(name), f"Restored '{name}'.")
+        self._ask(
+            "restore the offsets", lambda server: server.load_offsets(name), f"Restored '{name}'.",
+            terms=True,
+        )  # fmt: skip
 
     def _save(self) -> None:
         name = self.name.text().strip()
         self._ask("save the offsets", lambda server: server.save_offsets(name), f"Saved as '{name}'.")
 
-    def _ask(self, what: str, call: Callable[[Connection], OffsetsState], done: str) -> None:
+    def _ask(
+        self, what: str, call: Callable[[Connection], OffsetsState], done: str, *, terms: bool = False
+    ) -> None:
+        """Send a request; ``terms``: it sets the terms, so that the fields follow its answer."""
+        sent = self._edited.copy() if terms else set()
+        self._edited.difference_update(sent)
         self._show_message("Waiting for the server…")
 
         def on_done(state: OffsetsState) -> None:
             self._show(state)
             self._show_message(done)
-            for name, value in self._terms_now().items():
-                self.fields[name].setValue(value)
+            self._follow()
 
-        self._session.ask(
-            what, call, on_done, lambda reason: self._show_message(reason, bad=True), quiet=True
-        )
+        def on_error(reason: str) -> None:
+            self._edited.update(sent)
+            self._show_message(reason, bad=True)
+
+        self._session.ask(what, call, on_done, on_error, quiet=True)
 
     # ------------------------------------------------------------ display
     @property
@@ -167,7 +181,14 @@ class OffsetsDialog(QDialog):
 
     def _show_mode(self) -> None:
         self._show(self._state)
-        self.fields["mode"].setValue(self._terms_now()["mode"])
+        self._edited.discard("mode")
+        self._follow()
+
+    def _follow(self) -> None:
+        """Show the present offsets in the fields that were not edited."""
+        for name, value in self._terms_now().items():
+            if name not in self._edited:
+                self.fields[name].setValue(value)
 
     def update_buttons(self) -> None:
         """Show the newest offsets and what is possible now; called by the window while visible."""

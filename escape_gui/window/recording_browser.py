@@ -62,7 +62,7 @@ class RecordingBrowser(FolderBrowser["RecordingSummary"]):
             (size_text(entry.size), entry.size), (streams, streams),
         ]  # fmt: skip
 
-    def _enable(self) -> None:
+    def update_buttons(self) -> None:
         one, recording = self.selected, self._session.source.state.recording
         choose = "" if one is not None else "select a recording"
         goes_on = one is not None and recording.recording and Path(recording.path) == one.folder
@@ -72,13 +72,13 @@ class RecordingBrowser(FolderBrowser["RecordingSummary"]):
             self.delete_button, "Delete its files, after a question.",
             choose or ("it is being recorded" if goes_on else ""),
         )  # fmt: skip
-        if one is not None:
-            self.message.setText(str(one.folder))
-        elif not (recordings := self._entries()):
-            self.message.setText(f"No recording in {self._runs}.")
-        else:
-            total = sum(other.size for other in recordings)
-            self.message.setText(f"{len(recordings)} recordings, {size_text(total)}")
+
+    def _describe_selection(self) -> str:
+        if (one := self.selected) is not None:
+            return str(one.folder)
+        if not (recordings := self._entries()):
+            return f"No recording in {self._runs}."
+        return f"{len(recordings)} recordings, {size_text(sum(other.size for other in recordings))}"
 
     # ------------------------------------------------------------ actions
     def open_selected(self) -> None:

@@ -53,7 +53,7 @@ class RunBrowser(FolderBrowser[RunSummary]):
     def _details(entry: RunSummary) -> str:
         return entry.verdict
 
-    def _enable(self) -> None:
+    def update_buttons(self) -> None:
         run, why = self.selected, reason_no_change(self._session.request_context)
         choose = "" if run is not None else "select a run"
         no_matrix = "this run has no matrix" if run is not None and run.matrix is None else ""
@@ -62,12 +62,13 @@ class RunBrowser(FolderBrowser[RunSummary]):
         set_available(self.replay_button, "Show this run in the panels.", choose)
         set_available(self.folder_button, "Show the files of this run.", choose)
         set_available(self.file_button, "Add a matrix from a file to those that the loop can use.", why)
-        if run is not None:
-            self.message.setText(run.verdict)
-        elif self.table.rowCount() == 0:
-            self.message.setText(f"No finished run in {self._runs}.")
-        else:
-            self.message.setText("Select a run. Click a heading to sort.")
+
+    def _describe_selection(self) -> str:
+        if (run := self.selected) is not None:
+            return run.verdict
+        if self.table.rowCount() == 0:
+            return f"No finished run in {self._runs}."
+        return "Select a run. Click a heading to sort."
 
     # ------------------------------------------------------------ actions
     def load_selected(self) -> None:

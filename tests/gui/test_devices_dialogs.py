@@ -12,6 +12,7 @@ from PySide6.QtTest import QTest
 from pytestqt.qtbot import QtBot
 from scripted import ScriptedControl, ScriptedSource
 
+from escape_gui.client.session import EmptySource
 from escape_gui.main_window import MainWindow
 from escape_gui.panels.camera import CameraPanel
 from escape_gui.panels.mirror import MirrorPanel
@@ -277,3 +278,58 @@ def test_offsets_that_the_server_refuses_say_why(
     idle.change(phase=Phase.PROCEDURE, active_run=ActiveRun(id=5, name="docrime", arguments={}, stage=""))
     offsets.update_buttons()
     assert "a procedure is running" in offsets.buttons["apply"].toolTip()
+
+
+def test_settings_are_read_as_soon_as_the_engine_is_ready(
+    dialog: CameraDialog, control: ScriptedControl, idle: ScriptedSource, qtbot: QtBot
+) -> None:
+    dialog.reject()
+    control.refuse = "the engine is starting"
+    idle.change(phase=Phase.STARTING)
+    dialog.open_settings()
+    qtbot.waitUntil(lambda: dialog.message.text() == "the engine is starting")
+    assert "not read yet" in dialog.check_button.toolTip()
+    type_into(dialog, "exposure_s", "3")
+    control.refuse = ""
+    idle.change(phase=Phase.IDLE)
+    dialog.update_buttons()
+    qtbot.waitUntil(lambda: dialog.current["frame_rate_hz"].text() == "500.000")
+    assert dialog.fields["exposure_s"].value() == 3, "what was typed stays"
+    assert dialog.fields["frame_rate_hz"].value() == 500
+    control.camera = control.camera.model_copy(update={"exposure_s": 1e-3})
+    idle.change(engine_pid=12)
+    dialog.update_buttons()
+    qtbot.waitUntil(lambda: dialog.current["exposure_s"].text() == "1.0000")
+
+
+def test_typed_offsets_stay_when_something_else_is_set(
+    offsets: OffsetsDialog, control: ScriptedControl, idle: ScriptedSource, qtbot: QtBot
+) -> None:
+    tip = offsets.fields["tip"]
+    tip.setFocus()
+    tip.selectAll()
+    QTest.keyClicks(tip, "50")
+    qtbot.mouseClick(offsets.buttons["present_slopes"], Qt.MouseButton.LeftButton)
+    qtbot.waitUntil(lambda: offsets.message.text() == "Applied.")
+    assert (tip.value(), offsets.current["tip"].text()) == (50, "0.0")
+    control.refuse = "beyond a limit"
+    QTest.keyClick(tip, Qt.Key.Key_Return)
+    qtbot.waitUntil(lambda: offsets.message.text() == "beyond a limit")
+    control.refuse = ""
+    qtbot.mouseClick(offsets.buttons["clear_slopes"], Qt.MouseButton.LeftButton)
+    qtbot.waitUntil(lambda: offsets.message.text() == "Applied.")
+    assert tip.value() == 50
+    idle.change(offsets=control.offsets)
+    offsets.update_buttons()
+    qtbot.mouseClick(offsets.buttons["load"], Qt.MouseButton.LeftButton)
+    qtbot.waitUntil(lambda: offsets.message.text().startswith("Restored"))
+    assert (tip.value(), offsets.fields["focus"].value()) == (0, 60)
+
+
+def test_without_a_server_a_dialog_says_so(offsets: OffsetsDialog, window: MainWindow) -> None:
+    offsets._session.set_source(EmptySource(), None)
+    camera = window.camera_dialogs["wfs"]
+    camera.open_settings()
+    assert camera.message.text() == "there is no server"
+    QTest.keyClick(offsets.fields["tip"].lineEdit(), Qt.Key.Key_Return)
+    assert offsets.message.text() == "there is no server"

@@ -346,6 +346,18 @@ def test_long_names_of_matrices_fit_the_narrowest_window(
         # The first and the last letters distinguish them.
         assert selector.shown_text[0] == selector.currentText()[0]
         assert selector.shown_text[-1] == selector.currentText()[-1]
+    modes.mosaic.choose(2)
+    window.update_timer.tick(force=True)
+    QApplication.processEvents()
+    tiles = [one for one in modes.detail._tile_widgets if one[0].isVisible()]
+    assert len(tiles) > len(names)
+    for _, lines, image in tiles:
+        for line in lines:
+            assert_is_in_its_dock(line, window, "modes")
+            assert line.height() >= line.fontMetrics().height()
+            assert not line.geometry().intersects(image.geometry())
+        assert image.height() >= image.minimumHeight()
+        assert lines[0].text()[-1] == lines[0].whole_text[-1], "elided in the middle"
     short = ("push-pull", "ESCAPE (escape-17)")
     for text in short:
         selector.setItemText(selector.currentIndex(), text)

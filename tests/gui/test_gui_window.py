@@ -40,6 +40,7 @@ from escape_hw.remote.state import (
     Phase,
     ProcedureEntry,
     ProcedureParameter,
+    RecordingState,
 )
 from escape_hw.server.engine.procedures import ProcedureRegistry
 
@@ -510,3 +511,32 @@ def test_no_tab_bar_of_another_workspace_remains(make_window: MakeWindow) -> Non
             if len(cell.names) > 1
         }
         assert seen == wanted, one.name
+
+
+def test_no_error_makes_room_for_information(
+    small_window: MainWindow, source: ScriptedSource, monkeypatch: pytest.MonkeyPatch, qtbot: QtBot
+) -> None:
+    monkeypatch.setattr("escape_gui.window.notifications.DISPLAY_MS", 1)
+    notifications = small_window.notifications
+    notifications.show_message(Level.ERROR, "Could not open the loop", "why")
+    source.change(notes=("the previous server did not end cleanly", "run 3 can be resumed"))
+    small_window.update_timer.tick(force=True)
+    for number in range(4):
+        notifications.show_message(Level.GOOD, "Saved", f"/runs/{number}")
+    assert [one.title for one in notifications.notifications][:2] == [
+        "Could not open the loop", "Startup notice",
+    ]  # fmt: skip
+    qtbot.waitUntil(lambda: len(notifications.notifications) == 2, timeout=60_000)
+    assert notifications.notifications[1].text.splitlines() == list(source.state.notes)
+
+
+def test_a_recording_that_fails_is_notified(small_window: MainWindow, source: ScriptedSource) -> None:
+    source.change(recording=RecordingState(recording=True, path="/runs/1"))
+    small_window.update_timer.tick(force=True)
+    full = RecordingState(path="/runs/1", fault="94 MB free, below the limit of 268 MB; free some space")
+    for _ in range(2):
+        source.change(recording=full)
+        small_window.update_timer.tick(force=True)
+    (told,) = small_window.notifications.notifications
+    assert (told.level, told.title) == (Level.ERROR, "Recording ended")
+    assert told.text.startswith(full.fault)

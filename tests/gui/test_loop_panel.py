@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable
 
 import pytest
@@ -270,3 +271,21 @@ def test_setpoints_outlast_the_engine_and_the_connection_but_not_the_system(
     window.update_timer.tick(force=True)
     assert (loop.gain.value(), loop.matrix.currentText()) == (0.4, "escape")
     assert loop.message.text() == ""
+
+
+def test_what_is_typed_while_the_server_works_stays(
+    typist: Typist, loop: LoopPanel, control: ScriptedControl, qtbot: QtBot
+) -> None:
+    answer = threading.Event()
+    control.set_loop = lambda **changes: answer.wait(10)
+    typist.type(loop.gain, "0.35")
+    QTest.keyClick(loop.gain, Qt.Key.Key_Return)
+    typist.new_state()
+    QTest.mouseClick(loop.apply_button, Qt.MouseButton.LeftButton)
+    typist.type(loop.leak, "0.01")
+    answer.set()
+    qtbot.waitUntil(lambda: "Applied: gain 0.425 → 0.35" in loop.message.text())
+    typist.new_state(gain=0.35)
+    assert (loop.gain.value(), loop.leak.value()) == (0.35, 0.01)
+    assert loop.message.text().endswith("Edited since; press Check.")
+    assert "press Check first" in loop.apply_button.toolTip()

@@ -200,3 +200,15 @@ def test_gaps_and_relative_values_of_trends():
     )
     np.testing.assert_array_equal(points, [[0, 1], [0, 2], [1, 1]])
     assert 4 <= len(hour_ticks(0.0, 43200.0)) <= 8
+
+
+def test_a_note_without_a_server_stays_and_says_so(panel: NightPanel, source: ScriptedSource) -> None:
+    source.connected = False
+    panel.tick(source)
+    assert not panel.add_button.isEnabled()
+    assert "server not responding" in panel.add_button.toolTip()
+    panel.context.session.set_source(source, None)
+    QTest.keyClicks(panel.note, "clouds")
+    QTest.keyClick(panel.note, Qt.Key.Key_Return)
+    assert panel.note.text() == "clouds"
+    assert panel.message.text() == "The note is not in the log: there is no server"

@@ -17,7 +17,8 @@ from escape_gui.client.session import EmptySource, Session
 from escape_gui.main_window import MainWindow
 from escape_gui.panels.procedure import ProcedurePanel
 from escape_gui.settings import Settings
-from escape_hw.remote.state import Finish, FinishedRun, Phase, ProductEntry
+from escape_gui.views.procedure_form import parse_value
+from escape_hw.remote.state import Finish, FinishedRun, Phase, ProcedureParameter, ProductEntry
 
 
 @pytest.fixture
@@ -196,3 +197,9 @@ def test_a_refused_start_can_be_repeated(
     assert not panel.start.isEnabled()
     until(panel.start.isEnabled, calibrate)
     assert calibrate.notifications.notifications[-1].text == "the devices are in use"
+
+
+def test_a_decimal_comma_is_refused_with_the_remedy() -> None:
+    poke = ProcedureParameter(name="poke", kind="float", default=0.02, low=0.0, high=1.0)
+    with pytest.raises(ValueError, match="'0,05' is no number; write a decimal point"):
+        parse_value(poke, "0,05")

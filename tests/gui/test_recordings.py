@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import shutil
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -156,6 +158,19 @@ def test_an_unreadable_file_is_notified(empty, tmp_path, monkeypatch):
     empty.actions_by_name["open_product"].trigger()
     until(lambda: bool(told), empty)
     assert "im.fits: not a FITS file" in told[0]
+    assert not is_open(empty)
+
+
+@pytest.mark.parametrize("damage", [{"track": {"seconds": [1, 2]}}, {"bench": {"layout": ["1", "11"]}}])
+def test_a_run_with_a_damaged_document_is_notified(empty, folder, tmp_path, damage):
+    damaged = shutil.copytree(folder, tmp_path / "damaged")
+    document = json.loads((damaged / "result.json").read_text())
+    (damaged / "result.json").write_text(json.dumps(document | damage))
+    empty.replay.open(damaged)
+    until(lambda: bool(empty.notifications.notifications), empty)
+    (told,) = empty.notifications.notifications
+    assert "its document is damaged" in told.text
+    assert "open its products one by one" in told.text
     assert not is_open(empty)
 
 

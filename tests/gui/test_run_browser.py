@@ -86,7 +86,7 @@ def browser(window: MainWindow, qtbot: QtBot) -> RunBrowser:
     """The browser, opened with the button of the loop panel."""
     QTest.mouseClick(window.panels["loop"].load_button, Qt.MouseButton.LeftButton)
     browser = window.run_browser
-    qtbot.waitUntil(lambda: browser.table.rowCount() == 3)
+    qtbot.waitUntil(lambda: browser.table.rowCount() == 7)
     assert browser.isVisible()
     return browser
 
@@ -105,8 +105,8 @@ def click(browser: RunBrowser, name: str) -> None:
 
 
 def test_runs_are_listed_newest_first_and_filtered_by_typing(browser: RunBrowser) -> None:
-    assert shown(browser) == ["model-psf-8", "docrime-2", "escape-7"]
-    row = [browser.table.item(1, k).text() for k in range(browser.table.columnCount())]
+    assert shown(browser) == ["odd-13", "odd-12", "odd-11", "odd-10", "model-psf-8", "docrime-2", "escape-7"]
+    row = [browser.table.item(5, k).text() for k in range(browser.table.columnCount())]
     words = ("2026-11-22 01:02:03", "docrime-2", "maps-nir (simulated)", "DO-CRIME", "1,000", "not usable")
     assert row == [*words, "0.3 MB"]
     QTest.keyClicks(browser.filter, "razor good")
@@ -137,6 +137,15 @@ def test_a_run_without_a_matrix_cannot_be_loaded(browser: RunBrowser) -> None:
     assert browser.replay_button.isEnabled()
 
 
+def test_a_damaged_run_says_so(browser: RunBrowser) -> None:
+    click(browser, "odd-10")
+    assert browser.message.text().startswith("Damaged: its document is damaged (")
+    assert browser.message.text().endswith("Load its matrix as a file.")
+    assert not browser.load_button.isEnabled()
+    QTest.keyClicks(browser.filter, "damaged")
+    assert shown(browser) == ["odd-13", "odd-12", "odd-11", "odd-10"]
+
+
 def test_files_are_chosen_in_the_run_folder(
     browser: RunBrowser, window: MainWindow, runs: Path, control: ScriptedControl,
     monkeypatch: pytest.MonkeyPatch, qtbot: QtBot,
@@ -154,3 +163,19 @@ def test_files_are_chosen_in_the_run_folder(
     window.replay.ask_product()
     window.replay.ask_run()
     assert folders == [str(runs)] * 3
+
+
+def test_the_buttons_follow_the_state_and_the_message_stays(
+    browser: RunBrowser, window: MainWindow, source: ScriptedSource, qtbot: QtBot
+) -> None:
+    click(browser, "escape-7")
+    holder = source.state.lease
+    source.change(lease=None)
+    window.update_timer.tick(force=True)
+    assert "take control first" in browser.load_button.toolTip()
+    source.change(lease=holder)
+    window.update_timer.tick(force=True)
+    QTest.mouseClick(browser.load_button, Qt.MouseButton.LeftButton)
+    qtbot.waitUntil(lambda: "Loaded as 'escape-7'" in browser.message.text())
+    window.update_timer.tick(force=True)
+    assert "Loaded as 'escape-7'" in browser.message.text()

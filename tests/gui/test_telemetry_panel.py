@@ -7,8 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PySide6.QtCore import Qt
+from PySide6.QtCore import QPoint, QPointF, Qt
+from PySide6.QtGui import QWheelEvent
 from PySide6.QtTest import QTest
+from PySide6.QtWidgets import QApplication
 from scripted import ScriptedControl, ScriptedSource
 
 from escape_gui.main_window import MainWindow
@@ -190,3 +192,24 @@ def test_growth_in_words():
     assert describe_growth(RecordingState(), 0) == "no recording yet"
     full = RecordingState(path="/r", written=10, dropped=2, size=3_000_000_000, fault="disk full")
     assert describe_growth(full, 0) == "10 entries · 3.00 GB · 2 dropped · disk full"
+
+
+def test_nothing_is_recorded_without_a_server(
+    window: MainWindow, panel: TelemetryPanel, source: ScriptedSource
+) -> None:
+    assert panel.record_button.isEnabled()
+    source.connected = False
+    window.update_timer.tick(force=True)
+    assert "server not responding" in panel.record_button.toolTip()
+    assert not panel.record_button.isEnabled()
+
+
+def test_the_wheel_changes_no_field_without_the_focus(panel: TelemetryPanel) -> None:
+    panel.seconds.clearFocus()
+    place = QPointF(panel.seconds.rect().center())
+    turn = QWheelEvent(
+        place, QPointF(panel.seconds.mapToGlobal(place.toPoint())), QPoint(), QPoint(0, 120),
+        Qt.MouseButton.NoButton, Qt.KeyboardModifier.NoModifier, Qt.ScrollPhase.NoScrollPhase, False,
+    )  # fmt: skip
+    QApplication.sendEvent(panel.seconds, turn)
+    assert panel.seconds.value() == 10

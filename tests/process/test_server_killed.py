@@ -38,6 +38,7 @@ def test_the_fail_safe_process_flattens_the_mirror_of_a_killed_engine(system, be
         wait_for(lambda: guarded(client), "the fail-safe process has ended")
         assert spy.flat
         assert client.state.phase is Phase.FAULT
+        assert "offsets are zero" in client.state.fault.remedy
         assert not segments(pid=running)
         whole(tmp_path)
         # The accumulators were kept, and the next engine continues with them.
@@ -113,6 +114,9 @@ def test_a_front_that_was_killed_leaves_a_flat_mirror_and_a_note(system, bench, 
     with on_metal(system, server, tmp_path / ("long" * 20)) as served:
         with served.connect(control=True) as client:
             until_idle(client)
+            client.calibrate("docrime", frames=500)
+            products = client.state.products
+            assert [one.name for one in products if one.kind == "matrix"]
             run = client.start("docrime", frames=10_000_000)
             wait_for(lambda: bool(list(tmp_path.rglob("run.state"))) and not spy.flat, "the mirror is poked")
             front, engine = served.front, client.state.engine_pid
@@ -124,6 +128,7 @@ def test_a_front_that_was_killed_leaves_a_flat_mirror_and_a_note(system, bench, 
             until_idle(client)
             assert spy.flat
             assert client.state.active_run is None
+            assert client.state.products == products, "the matrices are offered again"
             with pytest.raises(CalibrationError, match="ended with its engine: the previous server"):
                 run.wait(60)
             client.acquire()
@@ -142,6 +147,7 @@ def test_a_front_that_was_killed_leaves_a_flat_mirror_and_a_note(system, bench, 
         with served.connect() as client:
             notes = " / ".join(client.state.notes)
         assert "did not end cleanly" in notes
+        assert "offsets are zero" in notes
         assert "docrime" in notes
         assert str(partial.parent) in notes
 

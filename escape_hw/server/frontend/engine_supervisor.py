@@ -26,7 +26,7 @@ from escape_hw.server.frontend.lease import LeaseManager
 from escape_hw.server.frontend.transport import ZmqTransport
 from escape_hw.server.ipc.channel import EngineSetup
 from escape_hw.server.ipc.log import ServerLog
-from escape_hw.server.safety.journal import ServerJournal
+from escape_hw.server.safety.journal import RESET, ServerJournal
 from escape_hw.server.safety.watchdog import Watchdog
 
 log = logging.getLogger(__name__)
@@ -77,7 +77,7 @@ def silence_limit_s(state: State, engine_pid: int, limits: ServerSection) -> flo
     return IDLE_SILENCE_LIMIT_S if starts or idle else limits.engine_silence_s
 
 
-_RESTART_REMEDY = "Read the log, then clear the fault to start the engine again."
+_RESTART_REMEDY = f"Read the log, then clear the fault to start the engine again: {RESET}."
 
 
 class EngineSupervisor:
@@ -167,6 +167,8 @@ class EngineSupervisor:
             violation = self._watchdog.check(self._published.state)
             if violation is not None:
                 self.make_safe(violation.reason, violation.remedy)
+            # Last: a full disk is an error.
+            self._journal.write_products(self._published.state.products)
             return
         self._on_message(message)
         if "run" in message:

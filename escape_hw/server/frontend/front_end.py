@@ -67,7 +67,8 @@ class FrontEnd:
         state = State(
             serial=first_number, at_utc=format_utc(), server_pid=server_pid, version=get_software_version(),
             system=config.system.name, simulated=config.simulated, seed=config.system.seed,
-            notes=self._journal.read_previous_end(), unattended_limit_s=config.server.unattended_s,
+            notes=self._journal.read_previous_end(), products=self._journal.products,
+            unattended_limit_s=config.server.unattended_s,
         )  # fmt: skip
         self._published = PublishedState(state, self._leases, transport, self._log)
         self._night_log = NightLog(config, runs, self._publish_night_entry)

@@ -14,11 +14,17 @@ from pydantic import ValidationError
 from escape_hw.io.fits.run_state import STATE_FILE
 from escape_hw.io.run_folder import RESULT_FILE, default_runs_folder
 from escape_hw.io.storage import write_atomic
+from escape_hw.remote.state import ProductEntry
 from escape_hw.server.safety.failsafe import IncidentReport
 from escape_hw.streams.segments import remove_orphaned
 from escape_hw.supervision import is_alive, process_start
 
 log = logging.getLogger(__name__)
+#: What an engine does not know of the one before.
+RESET = (
+    "gain, leak and camera settings are those of the system file again, offsets are zero, and a measured "
+    "dark frame or flat has to be measured again"
+)
 
 
 def server_folder() -> Path:
@@ -33,20 +39,35 @@ class ServerJournal:
     ----------
     last_run_id
         Number of the last run, also of a server that did not end cleanly.
+    products
+        Products that requests may name, also those of a server that did not end cleanly.
     """
 
     def __init__(self, system: str) -> None:
         self.system, self.folder = system, server_folder()
         self._path = self.folder / f"{system}.journal.json"
         self.last_run_id = 0
+        self.products: tuple[ProductEntry, ...] = ()
+        self._run: dict[str, Any] | None = None
 
     def write(self, run: dict[str, Any] | None) -> None:
         """Write the active run with its folder, or ``None``."""
-        pid = os.getpid()
+        self._run = run
         if run is not None:
             self.last_run_id = int(run["id"])
+        self._write()
+
+    def write_products(self, products: tuple[ProductEntry, ...]) -> None:
+        """Write the products, if they have changed."""
+        if products != self.products:
+            self.products = products
+            self._write()
+
+    def _write(self) -> None:
+        pid = os.getpid()
         content = {
-            "pid": pid, "started": process_start(pid), "run": run, "last_run_id": self.last_run_id,
+            "pid": pid, "started": process_start(pid), "run": self._run, "last_run_id": self.last_run_id,
+            "products": [one.model_dump(mode="json") for one in self.products],
         }  # fmt: skip
         write_atomic(self._path, json.dumps(content).encode())
 
@@ -62,7 +83,9 @@ class ServerJournal:
         notes = []
         if (stale := self._stale_journal()) is not None:
             self.last_run_id = int(stale.get("last_run_id", 0))
-            notes.append(f"the previous server (process {stale.get('pid')}) did not end cleanly")
+            with contextlib.suppress(TypeError, ValidationError):
+                self.products = tuple(ProductEntry.model_validate(one) for one in stale.get("products", ()))
+            notes.append(f"the previous server (process {stale.get('pid')}) did not end cleanly; {RESET}")
             if (run := stale.get("run")) is not None:
                 notes.append(_describe_run(run))
         for path in sorted(self.folder.glob(f"{self.system}-*.incident.json")):
