@@ -78,8 +78,22 @@ def check(window: MainWindow, width: int, height: int) -> None:
             assert_is_inside(button, window)
 
 
-@pytest.mark.parametrize("scale", [1.0, 1.2])
-@pytest.mark.parametrize("size", [(1024, 700), (1280, 760), (2560, 1400)])
+@pytest.mark.parametrize(
+    ("size", "scale"),
+    [
+        ((1024, 700), 1.2),
+        ((2560, 1400), 1.0),
+        *(
+            pytest.param(size, scale, marks=pytest.mark.slow)
+            for size, scale in (
+                ((1024, 700), 1.0),
+                ((1280, 760), 1.0),
+                ((1280, 760), 1.2),
+                ((2560, 1400), 1.2),
+            )
+        ),
+    ],
+)
 def test_safety_buttons_and_messages_are_visible(size: tuple[int, int], scale: float, show: Show) -> None:
     window = show(Settings(font_scale=scale))
     window.resize(*size)
