@@ -57,6 +57,8 @@ PLACES = {
     "reproduce, best gain": (lambda b, g: reproduce_shwfs(b, frames=400), "loop at gain", 0.2),
     "table 1": (lambda b, g: reproduce_table1(b, frames={"SHORT": 400, "LONG": 99_999}), "DO-CRIME", 0.006),
 }
+#: These are of the procedure that is reproduced, and stopped in it alone in the quick suite.
+PARTS = ("reproduce, DO-CRIME", "reproduce, model PSF", "reproduce, best gain")
 #: Where nothing is measured yet that could be kept.
 EMPTY = {
     "grid", "dark frame", "push-pull, grid", "push-pull, test step", "push-pull, long mode",
@@ -79,7 +81,9 @@ class StopThere:
             self.abort.set()
 
 
-@pytest.mark.parametrize("place", PLACES)
+@pytest.mark.parametrize(
+    "place", [pytest.param(place, marks=pytest.mark.slow if place in PARTS else ()) for place in PLACES]
+)
 def test_stopped_in(good, place):
     procedure, stage, share = PLACES[place]
     stop = StopThere(stage, share)
