@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from functools import cache, partial
 from typing import Any
 
-import pytest
 import small_system
 
 from escape_hw.api.modulator import Modulation
@@ -20,14 +18,6 @@ from escape_sim.devices import twins
 @cache
 def configuration(system: str) -> SystemConfig:
     return small_system.configuration() if system == "razor-shwfs" else load_system(system)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _little_noise() -> Iterator[None]:
-    """Detectors keep less noise in store: a bench opens at once."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("escape_sim.optics.detector.Detector.POOL", 1 << 19)
-        yield
 
 
 def fresh(make: Any, name: str, system: str = "razor-shwfs") -> Any:

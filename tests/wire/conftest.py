@@ -5,9 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
+from quick_benches import little_noise
 
 from escape_drivers.pi import modulator
 from escape_drivers.pi.transports import make_transport
+
+__all__ = ["little_noise", "short_auto_zero"]
 
 
 @pytest.fixture
