@@ -257,7 +257,10 @@ def wide_panels(window: MainWindow) -> set[str]:
     }
 
 
-@pytest.mark.parametrize("workspace", [one.name for one in WORKSPACES])
+@pytest.mark.parametrize(
+    "workspace",
+    [pytest.param(one.name, marks=pytest.mark.slow if one.name == "align" else ()) for one in WORKSPACES],
+)
 def test_panels_and_their_tabs_fit_the_narrowest_window(
     workspace: str, show: Show, source: ScriptedSource
 ) -> None:
