@@ -127,13 +127,17 @@ class Theme(QObject):
         return round(at_normal_size * self.scale)
 
     def apply(self) -> None:
-        """Set palette, font and style sheet of the application."""
+        """Set palette, font and style sheet of the application, unless it has them (a second window)."""
         application = QApplication.instance()
-        if isinstance(application, QApplication):
+        font, sheet = self.font(), style_sheet(self)
+        if isinstance(application, QApplication) and (application.font(), application.styleSheet()) != (
+            font,
+            sheet,
+        ):
             application.setStyle(QStyleFactory.create("Fusion"))
             application.setPalette(qt_palette(self.colours))
-            application.setFont(self.font())
-            application.setStyleSheet(style_sheet(self))
+            application.setFont(font)
+            application.setStyleSheet(sheet)
         self.changed.emit()
 
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from typing import Annotated
+from functools import cache
+from typing import Annotated, Any
 
 import typer
 
@@ -85,14 +86,21 @@ def build_app() -> typer.Typer:
 app = build_app()
 
 
+@cache
+def _make_command(application: typer.Typer) -> Any:
+    """The application as one command; made from all signatures, which takes as long as a short command."""
+    return typer.main.get_command(application)
+
+
 def run(arguments: Sequence[str] | None = None) -> None:
     """Run with these arguments (the process's own by default); ends the process."""
     words = current_words(sys.argv[1:] if arguments is None else arguments)
+    command = _make_command(app)
     if "--json" not in words:
-        app(words, prog_name="escape")
+        command(words, prog_name="escape")
     try:
         # Not standalone: a wrong option, too, must yield a document.
-        code = app(words, prog_name="escape", standalone_mode=False)
+        code = command(words, prog_name="escape", standalone_mode=False)
     except Exception as error:
         if not hasattr(error, "format_message") or not hasattr(error, "exit_code"):
             raise

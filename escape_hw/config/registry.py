@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import importlib.metadata
 import inspect
+import sys
 import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -279,10 +280,23 @@ def _load(group: str, name: str) -> Any:
     return factory
 
 
+@lru_cache(maxsize=32)
+def _installed(group: str, path: tuple[str, ...]) -> tuple[importlib.metadata.EntryPoint, ...]:
+    """Entry points of a group in the packages on a search path; finding them reads a file of each package."""
+    return tuple(importlib.metadata.entry_points(group=group))
+
+
+def _named(group: str, name: str) -> dict[str, importlib.metadata.EntryPoint]:
+    """Entry points of a name by their value."""
+    return {one.value: one for one in _installed(group, tuple(sys.path)) if one.name == name}
+
+
 def _find_entry(group: str, name: str, hardware: bool = False) -> importlib.metadata.EntryPoint:
-    entries = {
-        entry.value: entry for entry in importlib.metadata.entry_points(group=group) if entry.name == name
-    }
+    entries = _named(group, name)
+    if not entries:
+        # Perhaps installed since they were read.
+        _installed.cache_clear()
+        entries = _named(group, name)
     if not entries:
         raise ConfigError(_unknown_name_message(group, name, hardware))
     if len(entries) > 1:

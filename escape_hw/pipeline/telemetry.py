@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import signal
 
 from escape_hw.api.representation import short_repr
 from escape_hw.pipeline.control.integrator import gain_limit
@@ -77,6 +76,9 @@ def power_spectra(
     """
     longest = max(len(data) // _N_SEGMENTS, _MIN_SEGMENT)
     segment = min(2 ** int(np.log2(longest)), _MAX_SEGMENT, len(data))
+    # Imported in half the time of a command, and needed when a recording is analysed only.
+    from scipy import signal
+
     frequency, density = signal.welch(data, rate_hz, nperseg=segment, axis=0)
     return np.asarray(frequency[1:], float), np.asarray(density[1:], float)
 

@@ -5,9 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import pytest
+from quick_benches import little_noise
 
 from escape_hw.api.device import Device
 from escape_hw.testing import run_checks
+
+__all__ = ["catches", "little_noise"]
 
 
 @pytest.fixture

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import cache
 
+import pytest
 from usb_bus import VENDOR, UsbBackend, UsbPipe
 
 from escape_drivers.pi.modulator import PiModulator
@@ -65,9 +66,12 @@ def over_usb() -> PiModulator:
     return with_wire(connect)
 
 
-WIRES: dict[str, Factory] = {"tcp": over_tcp, "serial": over_serial, "usb": over_usb}
-
-
-@parametrize_device_checks(WIRES)
+@parametrize_device_checks({"tcp": over_tcp})
 def test_contract(factory: Factory, check: Check) -> None:
+    check(factory)
+
+
+@pytest.mark.slow
+@parametrize_device_checks({"serial": over_serial, "usb": over_usb})
+def test_contract_over_other_wires(factory: Factory, check: Check) -> None:
     check(factory)

@@ -57,6 +57,10 @@ PLACES = {
     "reproduce, best gain": (lambda b, g: reproduce_shwfs(b, frames=400), "loop at gain", 0.2),
     "table 1": (lambda b, g: reproduce_table1(b, frames={"SHORT": 400, "LONG": 99_999}), "DO-CRIME", 0.006),
 }
+#: In the quick suite, parts of what is reproduced are stopped alone, and DO-CRIME once in its stage.
+SLOW = (
+    "reproduce, DO-CRIME", "reproduce, model PSF", "reproduce, best gain", "DO-CRIME, past the burn-in",
+)  # fmt: skip
 #: Where nothing is measured yet that could be kept.
 EMPTY = {
     "grid", "dark frame", "push-pull, grid", "push-pull, test step", "push-pull, long mode",
@@ -79,7 +83,9 @@ class StopThere:
             self.abort.set()
 
 
-@pytest.mark.parametrize("place", PLACES)
+@pytest.mark.parametrize(
+    "place", [pytest.param(place, marks=pytest.mark.slow if place in SLOW else ()) for place in PLACES]
+)
 def test_stopped_in(good, place):
     procedure, stage, share = PLACES[place]
     stop = StopThere(stage, share)

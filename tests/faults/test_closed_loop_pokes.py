@@ -108,7 +108,7 @@ def test_fast_push_pull_under_turbulence_in_open_loop(good):
 @pytest.mark.parametrize(
     ("more", "allowed"),
     [
-        pytest.param(("twin.loss_probability=0.05",), 0.03, id="lost frames"),
+        pytest.param(("twin.loss_probability=0.05",), 0.03, id="lost frames", marks=pytest.mark.slow),
         pytest.param(
             ("twin.vibration.amplitude_rad=[4e-6,2e-6]", "twin.vibration.frequency_hz=[37.0,111.0]"),
             0.03,

@@ -179,7 +179,16 @@ def test_truncated_and_flipped_products(run, system, im, command, tmp_path):
         refused(bytes(flipped))
 
 
-def test_a_failed_camera_and_a_lost_mirror_exit_3(run, system, im, tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    "name",
+    [
+        "docrime",
+        "push-pull",
+        "loop",
+        *(pytest.param(name, marks=pytest.mark.slow) for name in ("escape", "reproduce")),
+    ],
+)
+def test_a_failed_camera_and_a_lost_mirror_exit_3(run, system, im, tmp_path, monkeypatch, name):
     monkeypatch.setattr(registry, "_REGISTERED", {})
     opened = []
 
@@ -199,22 +208,22 @@ def test_a_failed_camera_and_a_lost_mirror_exit_3(run, system, im, tmp_path, mon
         "loop": ("loop", system, "--im", im, "--frames", 300, "--no-strehl"),
         "reproduce": ("reproduce", "shwfs", "--system", system, "--frames", 300, "--loop-frames", 100),
     }
-    for name, words in commands.items():
-        out = tmp_path / f"camera-{name}"
-        code, document, err = run(*words, "--out", out, "--set", "devices.wfs.sim_driver=dying-camera")
-        assert (code, document["error"]["type"]) == (3, "FrameTimeout"), name
-        assert "wfs: no frame within 1 s" in err
-        assert "FrameTimeout" in (out / "run.log").read_text()
-        assert not list(out.glob("*.fits"))
-        dynamics = opened[-1]["simulated bench"].dynamics
-        dynamics.mean(dynamics._time, dynamics._time + 1)
-        assert not dynamics._target.any()
-        out = tmp_path / f"mirror-{name}"
-        code, document, err = run(*words, "--out", out, "--set", "devices.dm.sim_driver=dying-mirror")
-        assert (code, document["error"]["type"]) == (3, "DeviceLost"), name
-        assert "dm: lost" in err
-        # It could not be flattened any more: that is said.
-        assert "closing dm" in err
+    words, out = commands[name], tmp_path / "camera"
+    code, document, err = run(*words, "--out", out, "--set", "devices.wfs.sim_driver=dying-camera")
+    assert (code, document["error"]["type"]) == (3, "FrameTimeout"), name
+    assert "wfs: no frame within 1 s" in err
+    assert "FrameTimeout" in (out / "run.log").read_text()
+    assert not list(out.glob("*.fits"))
+    dynamics = opened[-1]["simulated bench"].dynamics
+    dynamics.mean(dynamics._time, dynamics._time + 1)
+    assert not dynamics._target.any()
+    code, document, err = run(
+        *words, "--out", tmp_path / "mirror", "--set", "devices.dm.sim_driver=dying-mirror"
+    )
+    assert (code, document["error"]["type"]) == (3, "DeviceLost"), name
+    assert "dm: lost" in err
+    # It could not be flattened any more: that is said.
+    assert "closing dm" in err
 
 
 def test_too_few_frames_no_light_and_no_response_exit_1(run, system, tmp_path):

@@ -38,7 +38,7 @@ def pull(found) -> np.ndarray:
 @pytest.mark.parametrize(
     "name",
     [
-        "undisturbed",
+        pytest.param("undisturbed", marks=pytest.mark.slow),
         "lost frames",
         pytest.param("vibration", marks=pytest.mark.slow),
         pytest.param("a matrix half as large", marks=pytest.mark.slow),

@@ -49,15 +49,25 @@ def test_docrime_with_shortened_pokes(good, name):
     assert np.abs((estimate.registration.to_array() - INJECTED) / estimate.sigma).max() < 4
 
 
-@pytest.mark.parametrize("name", SOME)
-def test_push_pull_with_shortened_pokes(good, name):
-    matrices = []
-    for limits in ((), (LIMITS[name],)):
-        with small("twin.loss_probability=0", *limits) as bench:
-            bench.screen.set(inserted=False)
-            matrices.append(bench.run(push_pull(bench, frames=15, grid=good.grid)).matrix)
-            assert_flat(bench)
-    free, limited = matrices
+def pushed(good, *limits):
+    with small("twin.loss_probability=0", *limits) as bench:
+        bench.screen.set(inserted=False)
+        matrix = bench.run(push_pull(bench, frames=15, grid=good.grid)).matrix
+        assert_flat(bench)
+    return matrix
+
+
+@pytest.fixture(scope="module")
+def free(good):
+    """The matrix of a mirror without such limits."""
+    return pushed(good)
+
+
+@pytest.mark.parametrize(
+    "name", ["stroke", *(pytest.param(name, marks=pytest.mark.slow) for name in LIMITS if name != "stroke")]
+)
+def test_push_pull_with_shortened_pokes(good, free, name):
+    limited = pushed(good, LIMITS[name])
     gain = np.vdot(limited.data, free.data) / np.vdot(free.data, free.data)
     # The spots answer smaller pokes with up to 4 % more: few of their pixels cross the threshold.
     assert gain == pytest.approx(1, abs=0.05)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from itertools import count, pairwise
 
 import numpy as np
@@ -34,37 +35,48 @@ def measure(good, loss, seed):
 
 @pytest.fixture(scope="module")
 def runs(good):
-    """Two runs for every rate of loss."""
-    return {loss: [measure(good, loss, seed) for seed in (3, 4)] for loss in (0.0, 0.01, 0.1)}
+    """Two runs for a rate of loss, made when they are asked for."""
+    return cache(lambda loss: [measure(good, loss, seed) for seed in (3, 4)])
 
 
-@pytest.mark.parametrize("loss", [0.01, 0.1])
+LOSSES = pytest.mark.parametrize("loss", [pytest.param(0.01, marks=pytest.mark.slow), 0.1])
+
+
+@LOSSES
 def test_the_same_matrix_within_its_noise(good, runs, loss):
-    for run in runs[loss]:
+    for run in runs(loss):
         assert run.result.frames == FRAMES
         expected = FRAMES * loss / (1 - loss)
         assert abs(run.result.lost_frames - expected) < 5 * np.sqrt(expected) + 1
         assert run.result.sky_seconds == pytest.approx((FRAMES + run.result.lost_frames) / 500, abs=0.01)
         chi2, gain = compare(run, good)
-        without = np.mean([compare(other, good)[0] for other in runs[0.0]])
+        without = np.mean([compare(other, good)[0] for other in runs(0.0)])
         # Errors of the same mode go together from slope to slope, so chi-squared scatters more than its name.
         assert chi2 == pytest.approx(without, abs=0.3)
         assert chi2 == pytest.approx(1, abs=0.45)
         assert gain == pytest.approx(1, abs=0.02)
-        delay = runs[0.0][0].result.response.delay_frames
+        delay = runs(0.0)[0].result.response.delay_frames
         assert run.result.response.delay_frames == pytest.approx(delay, abs=0.02)
+
+
+def median_error(found):
+    return np.median([run.result.matrix.sigma for run in found])
 
 
 def test_what_is_lost_shows_in_the_errors(runs):
     """Losing a tenth of the frames interrupts most histories of the filter, which sigma includes."""
-    size = {loss: np.median([r.result.matrix.sigma for r in found]) for loss, found in runs.items()}
-    assert size[0.0] < size[0.1] < 2 * size[0.0]
-    assert size[0.01] == pytest.approx(size[0.0], rel=0.1)
+    without, with_loss = (median_error(runs(loss)) for loss in (0.0, 0.1))
+    assert without < with_loss < 2 * without
 
 
-@pytest.mark.parametrize("loss", [0.01, 0.1])
+@pytest.mark.slow
+def test_a_hundredth_hardly_shows_in_the_errors(runs):
+    assert median_error(runs(0.01)) == pytest.approx(median_error(runs(0.0)), rel=0.1)
+
+
+@LOSSES
 def test_the_same_registration(good, runs, loss):
-    for run in runs[loss]:
+    for run in runs(loss):
         estimate = sprint(run.result.matrix, good.model, modes=20, covariance=run.solution.covariance)
         assert estimate.converged, estimate.warnings
         pulls = (estimate.registration.to_array() - INJECTED) / estimate.sigma
@@ -79,7 +91,7 @@ def test_overlooked_losses_would_be_seen(good, runs, monkeypatch):
         DocrimeEstimator, "partial_fit", lambda self, index, *rest: real(self, next(arrived), *rest)
     )
     run = measure(good, 0.1, 3)
-    right = runs[0.1][0].result
+    right = runs(0.1)[0].result
     assert np.median(run.result.matrix.sigma) > 2 * np.median(right.matrix.sigma)
     assert abs(run.result.response.delay_frames - right.response.delay_frames) > 0.02
 

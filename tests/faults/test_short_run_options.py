@@ -36,6 +36,9 @@ def test_a_signal_to_noise_ratio_is_refused_before_anything_moves(loop):
 @pytest.mark.parametrize(
     ("accuracy", "text"), [(50.0, "(reached)"), (1e-3, "(not reached; use more frames)")]
 )
+@pytest.mark.parametrize(
+    "loop", ["open loop", pytest.param("closed loop", marks=pytest.mark.slow)], indirect=True
+)
 def test_a_note_states_whether_the_accuracy_was_reached(loop, accuracy, text):
     with small() as bench:
         result = bench.run(escape(bench, frames=FRAMES, until=Target(accuracy=accuracy), **loop))

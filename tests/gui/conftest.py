@@ -27,6 +27,7 @@ from escape_gui.panels.camera import CameraPanel
 from escape_gui.panels.devices import DevicesPanel
 from escape_gui.panels.log import LogPanel
 from escape_gui.settings import Settings
+from escape_gui.widgets import controls
 
 
 @pytest.fixture(scope="session")
@@ -115,6 +116,12 @@ def make_window(session: Session, tmp_path: Path) -> Iterator[Callable[..., Main
     for window in made:
         if shiboken6.isValid(window):
             dispose(window)
+
+
+@pytest.fixture
+def short_hold(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Buttons that are held for a quarter of their time."""
+    monkeypatch.setattr(controls, "HOLD_MS", controls.HOLD_MS // 4)
 
 
 @pytest.fixture

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
+from functools import cache
 from types import SimpleNamespace
 from typing import Any
 
@@ -144,6 +145,33 @@ def counted(*microseconds: float) -> NDArray[np.float64]:
     return counts
 
 
+@cache
+def entries_of_all(geometry: Geometry, seed: int) -> Mapping[str, tuple[NDArray[Any], Mapping[str, float]]]:
+    """Read-only entries of every stream that the panels read, with what is known of them; made once."""
+    rng = np.random.default_rng(seed)
+    n_slopes = 2 * sum(row.count("1") for row in geometry.valid)
+    n_act = sum(row.count("1") for row in geometry.layout) or len(geometry.positions_m)
+    slopes, commands = rng.normal(0, 0.4, n_slopes), rng.normal(0, 0.1, n_act)
+    modes = rng.normal(0, 20, geometry.n_modes)
+    latencies, spacing = rng.gamma(60, 5.2, 4000), rng.normal(2000, 18, 4000)
+    streams: dict[str, NDArray[Any]] = {
+        "frames": spots(geometry, seed=seed),
+        "slopes": slopes,
+        "commands": commands,
+        "residual_modes": modes,
+        "psf": speckles(seed),
+        "model_psf": speckles(seed, strehl=1.0),
+        "latency_histogram": np.stack([counted(*latencies), counted(*spacing)]),
+    }
+    if geometry.positions_m:
+        streams["measured_positions"] = rng.normal(0, 4e-7, n_act)
+    for data in streams.values():
+        data.flags.writeable = False
+    return {
+        name: (data, {"full_scale": 1023.0} if name == "frames" else {}) for name, data in streams.items()
+    }
+
+
 def running(**changes: Any) -> State:
     """The state of a bench with a closed loop and this client in control."""
     values: dict[str, Any] = {
@@ -213,21 +241,8 @@ class ScriptedSource:
 
     def push_all(self, seed: int = 0) -> None:
         """Add an entry to every stream that the panels read."""
-        rng = np.random.default_rng(seed)
-        n_slopes = 2 * sum(row.count("1") for row in self.geometry_data.valid)
-        geometry = self.geometry_data
-        n_act = sum(row.count("1") for row in geometry.layout) or len(geometry.positions_m)
-        self.push("frames", spots(self.geometry_data, seed=seed), full_scale=1023.0)
-        self.push("slopes", rng.normal(0, 0.4, n_slopes))
-        self.push("commands", rng.normal(0, 0.1, n_act))
-        self.push("residual_modes", rng.normal(0, 20, self.geometry_data.n_modes))
-        self.push("psf", speckles(seed))
-        self.push("model_psf", speckles(seed, strehl=1.0))
-        latencies = rng.gamma(60, 5.2, 4000)
-        spacing = rng.normal(2000, 18, 4000)
-        self.push("latency_histogram", np.stack([counted(*latencies), counted(*spacing)]))
-        if self.geometry_data.positions_m:
-            self.push("measured_positions", rng.normal(0, 4e-7, n_act))
+        for stream, (data, meta) in entries_of_all(self.geometry_data, seed).items():
+            self.push(stream, data, **meta)
         line = LogLine(
             number=len(self.lines),
             at_utc=f"2026-11-21T21:{seed % 60:02d}:00.000",

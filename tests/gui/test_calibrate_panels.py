@@ -20,6 +20,7 @@ from scripted import ScriptedControl, ScriptedSource, running
 
 from escape_gui.client.session import Session
 from escape_gui.main_window import MainWindow
+from escape_gui.panels.base import Panel
 from escape_gui.panels.gains import GainsPanel
 from escape_gui.panels.modes import LIVE_LABEL, ModesPanel
 from escape_gui.panels.procedure import ProcedurePanel
@@ -88,14 +89,26 @@ def source() -> ScriptedSource:
     return source
 
 
-@pytest.fixture
-def calibrate(session: Session, tmp_path: Path) -> Iterator[MainWindow]:
-    kinds = (ProcedurePanel, ModesPanel, SprintPanel, GainsPanel)
-    window = show_window(session, tmp_path / "gui.json", kinds, Settings(workspace="calibrate"))
+def shown(session: Session, path: Path, *kinds: type[Panel]) -> MainWindow:
+    window = show_window(session, path, kinds, Settings(workspace="calibrate"))
     window.resize(1600, 1000)
     for dock in window.docks.values():
         dock.show()
     QApplication.processEvents()
+    return window
+
+
+@pytest.fixture
+def calibrate(session: Session, tmp_path: Path) -> Iterator[MainWindow]:
+    window = shown(session, tmp_path / "gui.json", ProcedurePanel, ModesPanel, SprintPanel, GainsPanel)
+    yield window
+    dispose(window)
+
+
+@pytest.fixture
+def form(session: Session, tmp_path: Path) -> Iterator[MainWindow]:
+    """A window with the form alone."""
+    window = shown(session, tmp_path / "gui.json", ProcedurePanel)
     yield window
     dispose(window)
 
@@ -304,14 +317,14 @@ def test_a_short_result_after_a_long_one_has_no_gaps(calibrate: MainWindow, sour
 
 # ---------------------------------------------------------------- keyboard
 def test_the_tab_key_goes_through_the_form_before_the_buttons(
-    calibrate: MainWindow, control: ScriptedControl
+    form: MainWindow, control: ScriptedControl
 ) -> None:
-    panel = calibrate.panels["procedure"]
-    until(panel.start.isEnabled, calibrate)
+    panel = form.panels["procedure"]
+    until(panel.start.isEnabled, form)
     panel.choice.setCurrentIndex(1)
     panel.choice.setCurrentIndex(0)
-    until(panel.start.isEnabled, calibrate)
-    calibrate.activateWindow()
+    until(panel.start.isEnabled, form)
+    form.activateWindow()
     panel.choice.setFocus()
     reached = []
     for _ in range(7):
@@ -417,126 +430,126 @@ def press_box(panel: GainsPanel) -> None:
 
 
 # ---------------------------------------------------------------- procedures
-def test_a_procedure_is_started_from_the_form(calibrate, source, control):
-    panel = calibrate.panels["procedure"]
-    look(calibrate)
+def test_a_procedure_is_started_from_the_form(form, source, control):
+    panel = form.panels["procedure"]
+    look(form)
     assert [panel.choice.itemText(k) for k in range(panel.choice.count())] == ["ESCAPE", "Optical gains"]
     assert not panel.start.isEnabled()
     enter_argument(panel.form, "frames", "200")
     enter_argument(panel.form, "pokes", "anticorrelated")
-    until(panel.start.isEnabled, calibrate)
+    until(panel.start.isEnabled, form)
     arguments = {"frames": 200, "pokes": "anticorrelated"}
     assert ("plan", {"procedure": "escape", "arguments": arguments}) in control.asked
     assert "frames" in panel.plan.text()
     assert "% of stroke" in panel.plan.text()
     press(panel.start)
-    until(lambda: any(verb == "start" for verb, _ in control.asked), calibrate)
+    until(lambda: any(verb == "start" for verb, _ in control.asked), form)
     assert ("start", {"args": ("escape",), **arguments}) in control.asked
 
 
-def test_an_invalid_form_starts_nothing(calibrate, control):
-    panel = calibrate.panels["procedure"]
-    look(calibrate)
-    until(panel.start.isEnabled, calibrate)
+def test_an_invalid_form_starts_nothing(form, control):
+    panel = form.panels["procedure"]
+    look(form)
+    until(panel.start.isEnabled, form)
     enter_argument(panel.form, "frames", "zero")
     assert not panel.start.isEnabled()
     press(panel.check)
     assert "'zero' is no number" in panel.plan.text()
-    look(calibrate)
+    look(form)
     assert not panel.start.isEnabled()
     assert "not checked" in panel.start.toolTip()
 
 
-def test_a_refusal_is_shown_below_the_form(calibrate, control):
-    panel = calibrate.panels["procedure"]
+def test_a_refusal_is_shown_below_the_form(form, control):
+    panel = form.panels["procedure"]
     control.refuse = "no light on the sensor"
-    look(calibrate)
-    until(lambda: "no light" in panel.plan.text(), calibrate)
+    look(form)
+    until(lambda: "no light" in panel.plan.text(), form)
     assert not panel.start.isEnabled()
     control.refuse = ""
 
 
-def test_a_procedure_is_monitored_paused_and_aborted(calibrate, source, control):
-    panel = calibrate.panels["procedure"]
-    look(calibrate)
+def test_a_procedure_is_monitored_paused_and_aborted(form, source, control):
+    panel = form.panels["procedure"]
+    look(form)
     assert not panel.abort.isEnabled()
     assert "no procedure is running" in panel.abort.toolTip()
     measure(source, 1.0)
     source.change(phase=Phase.PROCEDURE, active_run=RUNNING)
-    look(calibrate)
+    look(form)
     source.change()
-    look(calibrate)
+    look(form)
     assert panel.progress.text() == "DO-CRIME: 610 of 1000 frames, 4:12 min left"
     assert "worst mode 1: SNR" in panel._metrics.text()
     assert panel.bar.value() == 610
     assert "a procedure is running" in panel.start.toolTip()
     press(panel.pause)
-    until(lambda: ("pause", {}) in control.asked, calibrate)
+    until(lambda: ("pause", {}) in control.asked, form)
     source.change(active_run=RUNNING.model_copy(update={"paused": True}))
-    look(calibrate)
+    look(form)
     assert panel.pause.text() == "Resume"
     press(panel.pause)
-    until(lambda: ("resume", {}) in control.asked, calibrate)
+    until(lambda: ("resume", {}) in control.asked, form)
     press(panel.abort)
-    until(lambda: ("abort", {}) in control.asked, calibrate)
+    until(lambda: ("abort", {}) in control.asked, form)
 
 
-def test_the_result_is_compared_with_the_previous_one(calibrate, source):
-    panel = calibrate.panels["procedure"]
+def test_the_result_is_compared_with_the_previous_one(form, source):
+    panel = form.panels["procedure"]
     document = calibration_document(fake.calibration("escape"))
     first = FinishedRun(id=1, name="escape", finish=Finish.DONE, folder="/runs/1", document=document)
     source.change(last_run=first)
-    look(calibrate)
+    look(form)
     assert panel.outcome.text() == "Done: escape"
     assert "Δ" not in panel.numbers.text()
     assert not panel.report.isVisible()
     second = first.model_copy(update={"id": 2, "products": {"report": "/runs/2/report.html"}})
     source.change(last_run=second)
-    look(calibrate)
+    look(form)
     assert "(Δ 0.00 ± " in panel.numbers.text()
     assert panel.report.isVisible()
 
 
-def test_the_result_outlasts_the_engine_but_not_the_bench(calibrate, source, session, control):
-    panel = calibrate.panels["procedure"]
+def test_the_result_outlasts_the_engine_but_not_the_bench(form, source, session, control):
+    panel = form.panels["procedure"]
     document = calibration_document(fake.calibration("escape"))
     source.change(last_run=FinishedRun(id=2, name="escape", finish=Finish.DONE, document=document))
-    look(calibrate)
+    look(form)
     told = panel.numbers.text()
     source.change(engine_pid=12, last_run=None)
-    look(calibrate)
+    look(form)
     assert panel._result_area.isVisible()
     assert panel.numbers.text() == told
     source.change(last_run=FinishedRun(id=3, name="escape", finish=Finish.DONE, document=document))
-    look(calibrate)
+    look(form)
     assert "Δ" in panel.numbers.text(), "the result of the engine before is compared"
     session.set_source(ScriptedSource(running(system="maps-nir")), control)
-    look(calibrate)
+    look(form)
     assert not panel._result_area.isVisible()
 
 
-def test_new_matrices_are_offered_to_the_form(calibrate, source):
-    panel = calibrate.panels["procedure"]
-    look(calibrate)
+def test_new_matrices_are_offered_to_the_form(form, source):
+    panel = form.panels["procedure"]
+    look(form)
     panel.choice.setCurrentIndex(1)
     box = panel.form.fields["im"]
     assert box.currentText() == "–"
     names = ("first", "second")
     source.change(products=tuple(ProductEntry(name=name, kind="matrix", path="/x.fits") for name in names))
-    look(calibrate)
+    look(form)
     assert box.currentText() == "second"
     enter_argument(panel.form, "im", "first")
     source.change(
         products=(*source.state.products, ProductEntry(name="third", kind="matrix", path="/x.fits"))
     )
-    look(calibrate)
+    look(form)
     assert box.currentText() == "first"
 
 
-def test_without_control_nothing_starts(session, source, control, calibrate):
+def test_without_control_nothing_starts(session, source, control, form):
     source.change(lease=None)
-    look(calibrate)
-    panel = calibrate.panels["procedure"]
+    look(form)
+    panel = form.panels["procedure"]
     assert not panel.start.isEnabled()
     assert "take control" in panel.start.toolTip()
     assert panel.check.isEnabled()

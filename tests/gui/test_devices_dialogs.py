@@ -125,6 +125,7 @@ def mirror(window: MainWindow) -> MirrorPanel:
     return panel
 
 
+@pytest.mark.usefixtures("short_hold")
 def test_an_actuator_is_poked_by_arming_clicking_and_holding(
     window: MainWindow, mirror: MirrorPanel, control: ScriptedControl, qtbot: QtBot
 ) -> None:

@@ -78,8 +78,22 @@ def check(window: MainWindow, width: int, height: int) -> None:
             assert_is_inside(button, window)
 
 
-@pytest.mark.parametrize("scale", [1.0, 1.2])
-@pytest.mark.parametrize("size", [(1024, 700), (1280, 760), (2560, 1400)])
+@pytest.mark.parametrize(
+    ("size", "scale"),
+    [
+        ((1024, 700), 1.2),
+        ((2560, 1400), 1.0),
+        *(
+            pytest.param(size, scale, marks=pytest.mark.slow)
+            for size, scale in (
+                ((1024, 700), 1.0),
+                ((1280, 760), 1.0),
+                ((1280, 760), 1.2),
+                ((2560, 1400), 1.2),
+            )
+        ),
+    ],
+)
 def test_safety_buttons_and_messages_are_visible(size: tuple[int, int], scale: float, show: Show) -> None:
     window = show(Settings(font_scale=scale))
     window.resize(*size)
@@ -243,7 +257,10 @@ def wide_panels(window: MainWindow) -> set[str]:
     }
 
 
-@pytest.mark.parametrize("workspace", [one.name for one in WORKSPACES])
+@pytest.mark.parametrize(
+    "workspace",
+    [pytest.param(one.name, marks=pytest.mark.slow if one.name == "align" else ()) for one in WORKSPACES],
+)
 def test_panels_and_their_tabs_fit_the_narrowest_window(
     workspace: str, show: Show, source: ScriptedSource
 ) -> None:

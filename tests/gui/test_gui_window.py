@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 from gui_windows import dispose, settle, show_window
-from PySide6.QtCore import QPoint, Qt
+from PySide6.QtCore import QPoint, Qt, QTimer
 from PySide6.QtTest import QTest
 from PySide6.QtWidgets import (
     QAbstractButton,
@@ -24,12 +24,19 @@ from scripted import LEASE, ScriptedControl, ScriptedSource
 from escape_gui.client.session import EmptySource, Session
 from escape_gui.main_window import MainWindow
 from escape_gui.panels.base import ENGINE_ENDED_TEXT
+from escape_gui.panels.camera import CameraPanel
+from escape_gui.panels.log import LogPanel
+from escape_gui.panels.loop import LoopPanel
+from escape_gui.panels.mirror import MirrorPanel
+from escape_gui.panels.performance import PerformancePanel
 from escape_gui.panels.procedure import ProcedurePanel
+from escape_gui.panels.psf import PsfPanel
 from escape_gui.settings import Settings, load_settings
 from escape_gui.widgets.controls import Level
 from escape_gui.widgets.images import ImageViewer
 from escape_gui.window.docks import WORKSPACES
 from escape_gui.window.header import HeaderBar
+from escape_gui.window.notifications import DISPLAY_MS
 from escape_hw.config.loader import load_system
 from escape_hw.remote.source import DataSource
 from escape_hw.remote.state import (
@@ -71,8 +78,9 @@ def test_safety_buttons_never_move(window: MainWindow, source: ScriptedSource, q
 
 
 def test_safety_keys_work_from_everywhere(
-    window: MainWindow, control: ScriptedControl, qtbot: QtBot, qapp: QApplication
+    small_window: MainWindow, control: ScriptedControl, qtbot: QtBot, qapp: QApplication
 ) -> None:
+    window = small_window
     window.panels["log"].search.setFocus()
     qtbot.keyClick(
         window.panels["log"].search,
@@ -217,7 +225,7 @@ def test_the_form_and_its_result_have_room(make_window: MakeWindow, source: Scri
         assert field.width() >= 60
 
 
-@pytest.mark.parametrize("system", ["razor-shwfs", "razor-pywfs"])
+@pytest.mark.parametrize("system", [pytest.param("razor-shwfs", marks=pytest.mark.slow), "razor-pywfs"])
 def test_the_forms_of_all_procedures_fit(
     make_window: MakeWindow, source: ScriptedSource, system: str
 ) -> None:
@@ -238,12 +246,9 @@ def test_the_forms_of_all_procedures_fit(
     assert too_wide == []
 
 
-def test_a_notification_covers_no_panel(
-    small_window: MainWindow, qtbot: QtBot, qapp: QApplication, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_notification_covers_no_panel(small_window: MainWindow, qtbot: QtBot, qapp: QApplication) -> None:
     window, notifications = small_window, small_window.notifications
     where = {name: dock.geometry() for name, dock in window.docks.items()}
-    monkeypatch.setattr("escape_gui.window.notifications.DISPLAY_MS", 2000)
     notifications.show_message(Level.ERROR, "Not saved", "the disk is full, " * 40 + "\n/runs/2")
     notifications.show_message(Level.GOOD, "Saved", "/runs/3")
     qapp.processEvents()
@@ -255,6 +260,10 @@ def test_a_notification_covers_no_panel(
     assert window.width() == 1280
     assert "/runs/2" in bad.toolTip()
     # Information disappears after a time; the error is shown again and stays.
+    assert bad.findChildren(QTimer) == []
+    (timer,) = good.findChildren(QTimer)
+    assert (timer.interval(), timer.isSingleShot(), timer.isActive()) == (DISPLAY_MS, True, True)
+    timer.start(1)
     qtbot.waitUntil(lambda: notifications.notifications == [bad], timeout=60_000)
     qapp.processEvents()
     assert bad.isVisible()
@@ -296,8 +305,9 @@ def test_a_tab_behind_another_costs_nothing(window: MainWindow, source: Scripted
 
 
 def test_a_broken_panel_does_not_stop_the_others(
-    window: MainWindow, source: ScriptedSource, caplog: pytest.LogCaptureFixture
+    make_window: MakeWindow, source: ScriptedSource, caplog: pytest.LogCaptureFixture
 ) -> None:
+    window = make_window((PsfPanel, CameraPanel))
     source.push("psf", source.streams["psf"].data.ravel())
     window.update_timer.tick(force=True)
     assert list(window.update_timer.failed_panels) == ["psf"]
@@ -332,7 +342,7 @@ def test_frozen_panels_stop_but_the_header_updates(small_window: MainWindow, sou
 def test_after_the_end_of_the_engine_nothing_stale_is_shown(
     make_window: MakeWindow, source: ScriptedSource
 ) -> None:
-    window = make_window()
+    window = make_window((CameraPanel, PsfPanel, MirrorPanel, LoopPanel, ProcedurePanel))
     source.fail("the engine (process 11) died")
     source.change(engine_pid=0, streams=())
     window.update_timer.tick(force=True)
@@ -389,7 +399,8 @@ def test_equal_log_lines_are_collapsed(small_window: MainWindow, source: Scripte
 
 def test_layout_and_theme_are_saved(make_window: MakeWindow, tmp_path: Path) -> None:
     settings_path = tmp_path / "gui.json"
-    window = make_window()
+    panels = (CameraPanel, PerformancePanel, LogPanel)
+    window = make_window(panels)
     window.docks["log"].close()
     window.show_workspace("align")
     window.toggle_theme()
@@ -397,7 +408,7 @@ def test_layout_and_theme_are_saved(make_window: MakeWindow, tmp_path: Path) -> 
     window.close_without_question()
     settings, warnings = load_settings(settings_path)
     assert warnings == ()
-    window = make_window(settings=settings)
+    window = make_window(panels, settings)
     assert window.workspace.name == "align"
     assert (window.context.theme.palette_name, window.context.theme.scale) == ("light", 1.1)
     assert window.docks["camera"].isVisible()
@@ -408,7 +419,7 @@ def test_layout_and_theme_are_saved(make_window: MakeWindow, tmp_path: Path) -> 
 
 def test_an_invalid_layout_is_ignored(make_window: MakeWindow) -> None:
     settings = Settings(layouts={"operate": "AAAA"}, geometry="%%%", workspace="gone")
-    window = make_window(settings=settings)
+    window = make_window((CameraPanel, LogPanel), settings)
     assert window.workspace.name == "operate"
     assert window.docks["camera"].isVisible()
 
@@ -449,7 +460,7 @@ def test_a_window_without_a_source_starts(tmp_path: Path) -> None:
     session = Session()
     quiet: DataSource = EmptySource()
     assert not quiet.connected
-    window = show_window(session, tmp_path / "gui.json")
+    window = show_window(session, tmp_path / "gui.json", (CameraPanel, LoopPanel))
     assert window.panels["camera"].shows_placeholder
     header = window.header
     assert "escape serve SYSTEM" in header.connection_banner.text()
@@ -463,7 +474,7 @@ def test_a_window_without_a_source_starts(tmp_path: Path) -> None:
     session.close()
 
 
-@pytest.mark.parametrize("scale", [1.0, 1.4])
+@pytest.mark.parametrize("scale", [pytest.param(1.0, marks=pytest.mark.slow), 1.4])
 def test_the_window_fits_a_small_screen(
     make_window: MakeWindow, source: ScriptedSource, scale: float
 ) -> None:

@@ -183,6 +183,7 @@ def test_the_buttons_of_a_field_are_drawn_and_stay_in_range(loop: LoopPanel, qtb
     assert "0 to 2" in loop.gain.toolTip()
 
 
+@pytest.mark.usefixtures("short_hold")
 def test_closing_needs_a_held_button_and_shows_its_values(
     loop: LoopPanel, source: ScriptedSource, window: MainWindow, control: ScriptedControl, qtbot: QtBot
 ) -> None:
@@ -199,6 +200,7 @@ def test_closing_needs_a_held_button_and_shows_its_values(
     assert control.asked == [("close_loop", {"args": ("escape", 0.4, 0.02, 3)})]
 
 
+@pytest.mark.usefixtures("short_hold")
 def test_only_checked_values_close_the_loop(
     loop: LoopPanel, source: ScriptedSource, typist: Typist, control: ScriptedControl, qtbot: QtBot
 ) -> None:

@@ -20,6 +20,11 @@ from PySide6.QtWidgets import QApplication, QFileDialog
 from escape_gui.client.session import Session
 from escape_gui.main_window import MainWindow
 from escape_gui.panels import PANELS
+from escape_gui.panels.base import Panel
+from escape_gui.panels.camera import CameraPanel
+from escape_gui.panels.mirror import MirrorPanel
+from escape_gui.panels.procedure import ProcedurePanel
+from escape_gui.panels.sprint import SprintPanel
 from escape_gui.replay.source import ReplaySource
 from escape_gui.settings import Settings
 from escape_gui.widgets.controls import Level
@@ -31,10 +36,16 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def empty(tmp_path: Path) -> Iterator[MainWindow]:
+def panels() -> tuple[type[Panel], ...]:
+    """The panels of the window: those that most tests look at."""
+    return (ProcedurePanel, SprintPanel, CameraPanel, MirrorPanel)
+
+
+@pytest.fixture
+def empty(panels: tuple[type[Panel], ...]) -> Iterator[MainWindow]:
     """A window without a source."""
     session = Session()
-    window = MainWindow(session, Settings(workspace="operate"), None)
+    window = MainWindow(session, Settings(workspace="operate"), None, panels)
     window.resize(1600, 1000)
     window.show()
     yield window
@@ -57,6 +68,7 @@ def is_open(window: MainWindow) -> bool:
     return isinstance(window.context.session.source, ReplaySource)
 
 
+@pytest.mark.parametrize("panels", [PANELS], ids=["all panels"])
 def test_a_run_is_shown_by_every_panel(empty, folder):
     empty.replay.open(folder)
     until(lambda: is_open(empty), empty)

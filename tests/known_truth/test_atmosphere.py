@@ -180,7 +180,7 @@ def test_frozen_flow_moves_the_pattern_with_the_wind():
     assert np.std(after - before) > 5 * stays * np.std(before)
 
 
-@pytest.mark.parametrize("lag", [0.05, 0.3, 0.8])
+@pytest.mark.parametrize("lag", [0.3, *(pytest.param(lag, marks=pytest.mark.slow) for lag in (0.05, 0.8))])
 def test_space_and_time_covariance(lag):
     """Frozen flow and boiling together: <p(x, t) p(x + r, t + lag)> = rho(lag) C(r - v lag)."""
     boiling, wind = 0.5, (6.0, 2.0)

@@ -31,7 +31,9 @@ def calibrated(*more: str, frames: int = 400, estimator: str = "auto") -> Calibr
     return result
 
 
-@pytest.mark.parametrize("kind", ["kl", "zonal", "zernike", "fourier"])
+@pytest.mark.parametrize(
+    "kind", ["kl", "zonal", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("zernike", "fourier"))]
+)
 def test_every_basis_gives_the_registration(kind):
     result = calibrated(f"basis.kind={kind}")
     assert result.measured is not None

@@ -32,13 +32,16 @@ def frame(
     """Four images of one eaten pupil with a shadow in it."""
     rim, image = eaten(rng, depth), np.zeros(SHAPE)
     for cx, cy in centres:
-        x, y = (np.arange(80) - cx) / N, (np.arange(80) - cy) / N
+        # Only the pixels that this image may reach.
+        columns, rows = (slice(int(c - N / 2) - 1, int(c + N / 2) + 3) for c in (cx, cy))
+        x, y = (np.arange(80)[columns] - cx) / N, (np.arange(80)[rows] - cy) / N
         inner = (np.arange(FINE) + 0.5) / FINE - 0.5
         fx, fy = ((at[:, None] + inner / N).ravel() for at in (x, y))
         degree = (np.rad2deg(np.arctan2(fy[:, None], fx)) % 360).astype(int)
-        inside = (np.hypot(fx, fy[:, None]) <= rim[degree]).reshape(80, FINE, 80, FINE).mean(axis=(1, 3))
+        inside = np.hypot(fx, fy[:, None]) <= rim[degree]
+        inside = inside.reshape(y.size, FINE, x.size, FINE).mean(axis=(1, 3))
         slope = 1 + rng.uniform(-0.2, 0.2) * x[None, :] + rng.uniform(-0.2, 0.2) * y[:, None]
-        image += (
+        image[rows, columns] += (
             400 * inside * slope * transmitted_fraction(TELESCOPE, DIAMETER_M, x * DIAMETER_M, y * DIAMETER_M)
         )
     # What diffraction adds to the pixels' own width.

@@ -96,6 +96,8 @@ def compared(design: Design, noise: float, m2c: np.ndarray | None = None) -> np.
     return np.array(errors)
 
 
+# Each of these two with one sensor, together with both; the other halves are slow.
+@pytest.mark.parametrize("design", [lenslets, pytest.param(pyramid, marks=pytest.mark.slow)], indirect=True)
 def test_a_well_measured_mirror_is_recovered(design: Design) -> None:
     found, nominal = compared(design, 0.1).T
     assert (found < 0.25 * nominal).all()
@@ -123,6 +125,7 @@ def test_a_poorly_measured_mirror_is_not_changed(design: Design) -> None:
     assert (found < 1.2 * nominal).all()
 
 
+@pytest.mark.parametrize("design", [pytest.param(lenslets, marks=pytest.mark.slow), pyramid], indirect=True)
 def test_the_matrix_holds_for_modes_that_were_never_poked(design: Design) -> None:
     other = np.random.default_rng(1).standard_normal((design.model.n_act, 12))
     # Single actuators are poked alone by no mode of the calibration.

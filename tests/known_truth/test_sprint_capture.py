@@ -51,8 +51,8 @@ def matrix_at(model: ShackHartmannModel) -> Callable[[Registration], Interaction
     "injected",
     [
         Registration(shift_x=-200.0, shift_y=150.0),
-        Registration(rotation=10.0),
-        Registration(0, 0, 0, 10, -10),
+        pytest.param(Registration(rotation=10.0), marks=pytest.mark.slow),
+        pytest.param(Registration(0, 0, 0, 10, -10), marks=pytest.mark.slow),
     ],
     ids=str,
 )

@@ -52,7 +52,9 @@ class ModelWithVariant:
         return getattr(self._sharp, name)
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize(
+    "seed", [0, 1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(2, 6))]
+)
 def test_large_amplitudes_are_fitted_with_the_registration(seed: int) -> None:
     config = load_system("razor-shwfs", overrides=SMALL)
     sharp = make_fast_model(config, None)

@@ -26,9 +26,9 @@ def _calibrate(number: int, frames: int, *more: str) -> tuple[np.ndarray, Calibr
     return result.registration.registration.to_array() - realisation.to_array(), result
 
 
-@pytest.fixture(scope="module")
-def fifty() -> list[tuple[np.ndarray, CalibrationResult]]:
-    return [_calibrate(number, 50, *GAUSSIAN_TWIN) for number in (0, 1)]
+@pytest.fixture(scope="module", params=[1, pytest.param(2, marks=pytest.mark.slow)])
+def fifty(request: pytest.FixtureRequest) -> list[tuple[np.ndarray, CalibrationResult]]:
+    return [_calibrate(number, 50, *GAUSSIAN_TWIN) for number in range(request.param)]
 
 
 @pytest.mark.slow

@@ -12,7 +12,11 @@ SEEDS = 16
 
 
 @pytest.mark.parametrize(
-    "gain", [0.4, np.linspace(0.05, 0.6, simulated.N_MODES)], ids=["one", "of each mode"]
+    "gain",
+    [
+        pytest.param(0.4, id="one", marks=pytest.mark.slow),
+        pytest.param(np.linspace(0.05, 0.6, simulated.N_MODES), id="of each mode"),
+    ],
 )
 def test_weak_first_frames_do_not_spoil_the_gain(gain):
     """Pokes so weak that the first thousand frames may miss the gain by any factor."""

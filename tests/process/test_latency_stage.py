@@ -27,7 +27,7 @@ def of_others(one: segments.Segment) -> bool:
     return parent != os.getpid()
 
 
-@pytest.mark.parametrize("streams", [False, True])
+@pytest.mark.parametrize("streams", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_frames_of_another_process_are_answered(monkeypatch, streams):
     monkeypatch.setattr(latency, "WARM_UP", 20)
     case = latency.make_case(4, 8, 12, 200.0)

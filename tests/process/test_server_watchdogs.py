@@ -138,6 +138,7 @@ def shaken(camera: Any, wait_s: float) -> tuple[int, bytes]:
     return bench_server._OK, bench_server._FRAME_HEAD.pack(frame.index, frame.exposed_ns) + image.tobytes()
 
 
+@pytest.mark.slow
 def test_a_diverging_residual(closed, mirror, monkeypatch) -> None:
     # The residual's usual size has to be known first, by its state five times a second.
     seen = {closed.state.serial}

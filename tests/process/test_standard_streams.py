@@ -13,11 +13,26 @@ pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="de
 
 #: Short commands with a table, with a document, and those that end before any command begins.
 COMMANDS = [("systems",), ("systems", "--json"), ("--help",)]
+#: Every command with Python's buffers, and in the quick suite one of them without.
+EVERY = pytest.mark.parametrize(
+    ("bare", "words"),
+    [
+        pytest.param(
+            bare,
+            words,
+            id=f"{bare}-{' '.join(words)}",
+            marks=() if bare == "buffered" or words == COMMANDS[1] else pytest.mark.slow,
+        )
+        for bare in ("buffered", "unbuffered")
+        for words in COMMANDS
+    ],
+    indirect=["bare"],
+)
 #: What the message says of a full device, and of a pipe.
 NO_ROOM, NO_READER = "No space left on device", "Broken pipe"
 
 
-@pytest.fixture(scope="module", params=["buffered", "unbuffered"])
+@pytest.fixture(scope="module", params=["buffered", pytest.param("unbuffered", marks=pytest.mark.slow)])
 def bare(request, tmp_path_factory) -> dict[str, str]:
     """An environment with nothing in it that this test does not put there."""
     home = tmp_path_factory.mktemp("home")
@@ -45,7 +60,7 @@ def closing(descriptor: int):
     return lambda: os.close(descriptor)
 
 
-@pytest.mark.parametrize("words", COMMANDS, ids=" ".join)
+@EVERY
 def test_a_full_device_is_no_success(bare, words):
     with open("/dev/full", "w") as full:
         done = ended(words, bare, stdout=full, stderr=subprocess.PIPE)
@@ -53,7 +68,7 @@ def test_a_full_device_is_no_success(bare, words):
     assert done.stderr == f"error: standard output cannot be written ({NO_ROOM})\n"
 
 
-@pytest.mark.parametrize("words", COMMANDS, ids=" ".join)
+@EVERY
 def test_a_pipe_without_a_reader_is_no_success(bare, words):
     nobody = without_reader()
     done = ended(words, bare, stdout=nobody, stderr=subprocess.PIPE)
@@ -77,7 +92,7 @@ def test_the_first_lines_of_a_long_table(bare, im):
     assert told == ""
 
 
-@pytest.mark.parametrize("words", COMMANDS, ids=" ".join)
+@EVERY
 def test_a_command_without_standard_output(bare, words):
     done = ended(words, bare, stderr=subprocess.PIPE, preexec_fn=closing(1))
     assert done.returncode == 1

@@ -8,6 +8,7 @@ import time
 from pathlib import Path
 
 import pytest
+from serving import wait_for
 
 from escape_hw.errors import CalibrationError
 from escape_hw.runtime.sweep.workers import LocalWorkers
@@ -29,6 +30,11 @@ def die_once(mark: str) -> str:
     os._exit(1)
 
 
+def begin_and_sleep(mark: str) -> None:
+    Path(mark).touch()
+    time.sleep(60)
+
+
 def test_a_call_whose_worker_ends_is_made_again(workers, tmp_path):
     assert workers.run(die_once, str(tmp_path / "mark")) == "done"
 
@@ -43,18 +49,18 @@ def test_workers_that_die_again_and_again_are_given_up(workers):
         workers.run(os._exit, 1)
 
 
-def test_closing_ends_a_call_at_once(workers):
+def test_closing_ends_a_call_at_once(workers, tmp_path):
     found = []
 
     def wait() -> None:
         try:
-            workers.run(time.sleep, 60)
+            workers.run(begin_and_sleep, str(tmp_path / "begun"))
         except CalibrationError as error:
             found.append(str(error))
 
     thread = threading.Thread(target=wait)
     thread.start()
-    time.sleep(2)
+    wait_for((tmp_path / "begun").exists, "the call begins")
     began = time.monotonic()
     workers.close()
     thread.join(10)

@@ -6,12 +6,15 @@ import fake_bench
 import fake_results as fake
 import pytest
 from command_line import document, escape
+from quick_benches import little_noise
 
 from escape_hw.io.fits.matrix import save_matrix
 from escape_hw.report.figures import style
 from escape_hw.report.run_report import REPORT, write_report
 
-__all__ = ["bench", "document", "empty_reports", "escape", "im", "pictures", "reports", "undrawn"]
+__all__ = [
+    "bench", "document", "empty_reports", "escape", "im", "little_noise", "pictures", "reports", "undrawn",
+]  # fmt: skip
 
 PNG = style.png
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from small_system import configuration
 
 from escape_hw.api.adaptive_secondary import STATE_ORDER, AdaptiveSecondary, ShellState
-from escape_hw.config.loader import load_system
 from escape_hw.config.registry import DeviceContext
 from escape_hw.errors import DeviceError, NotOpen
 from escape_sim.devices.twins import SimAdaptiveSecondary, make_secondary
@@ -21,8 +21,7 @@ QUICK = [
 
 
 def twin(*overrides: str) -> SimAdaptiveSecondary:
-    config = load_system("razor-shwfs", overrides=[*QUICK, *overrides])
-    return make_secondary(None, DeviceContext("asm", config))
+    return make_secondary(None, DeviceContext("asm", configuration(*QUICK, *overrides)))
 
 
 def wait(mirror: SimAdaptiveSecondary, seconds: float = 0.05) -> None:

@@ -2,6 +2,7 @@
 
 import importlib.metadata
 import sys
+from collections.abc import Iterator
 from importlib.metadata import EntryPoint, EntryPoints
 from pathlib import Path
 
@@ -50,6 +51,14 @@ from escape_hw import DeformableMirror
 class Halfway(DeformableMirror):
     pass
 """
+
+
+@pytest.fixture(autouse=True)
+def read_again() -> Iterator[None]:
+    """Entry points are read in each test, and not kept from it."""
+    registry._installed.cache_clear()
+    yield
+    registry._installed.cache_clear()
 
 
 @pytest.fixture
@@ -198,6 +207,16 @@ def test_the_same_entry_seen_twice_is_one(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr(importlib.metadata, "entry_points", entries(entry, entry))
     assert registry.device_factory("twin").__name__ == "hypot"
     assert registry.available(registry.DEVICES) == ("twin",)
+
+
+def test_entry_points_are_read_once_and_again_for_an_unknown_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A package may be installed while Python runs."""
+    twin, later = (EntryPoint(name, "math:hypot", registry.DEVICES) for name in ("twin", "later"))
+    monkeypatch.setattr(importlib.metadata, "entry_points", entries(twin))
+    assert registry.device_factory("twin").__name__ == "hypot"
+    monkeypatch.setattr(importlib.metadata, "entry_points", entries(later))
+    assert registry.device_factory("twin").__name__ == "hypot"
+    assert registry.device_factory("later").__name__ == "hypot"
 
 
 def test_nothing_installed_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -147,6 +147,7 @@ def test_requests_arrive_whole_or_not_at_all(requests, cuts, missing) -> None:
     assert len(received) == sum(end <= len(stream) for end in whole)
 
 
+@pytest.mark.slow
 def test_a_genicam_camera_is_the_sensor_of_revolt() -> None:
     changes = (
         "basis.n_modes=20", "calibration.sprint_modes=20", "loop.dropped_modes=0", "calibration.poke=0.02",

@@ -69,6 +69,7 @@ def test_a_camera_is_read_by_its_driver(document, tmp_path) -> None:
     assert (code, found["status"]["lost"]) == (0, 0)
 
 
+@pytest.mark.usefixtures("short_auto_zero")
 def test_a_stage_is_turned_by_its_driver(document, escape) -> None:
     words = ["--driver", "pi-e727", "--set", "kind=emulator"]
     circle = ["--radius-rad", 1.4e-4, "--frequency", 303.0, "--seconds", 0]

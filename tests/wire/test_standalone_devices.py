@@ -20,6 +20,8 @@ from escape_hw.errors import ConfigError, DeviceError, NotOpen, SettingRejected
 from escape_hw.safety.limits import CAUTIOUS_LIMITS
 from escape_hw.testing import Check, Factory, parametrize_device_checks
 
+pytestmark = pytest.mark.usefixtures("short_auto_zero")
+
 
 def mirror(**settings) -> AlpaoMirror:
     fresh("asdk", "set serial BAX118")

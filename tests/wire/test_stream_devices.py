@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from streams import PERIOD_S, SHAPE, camera_config, create, mirror_config, published, ramp
 
+from escape_drivers.streams import camera as stream_camera
 from escape_hw.config.loader import load_system
 from escape_hw.config.registry import DeviceContext, device_factory
 from escape_hw.config.system import SystemConfig
@@ -148,7 +149,9 @@ def test_what_does_not_fit_is_refused_by_name(kind: str, key: str) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_silent_stream_times_out_and_states_who_to_ask(kind: str) -> None:
+def test_a_silent_stream_times_out_and_states_who_to_ask(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    # The rate cannot be measured on opening, however long.
+    monkeypatch.setattr(stream_camera, "_RATE_TIMEOUT_S", 0.05)
     name = f"{TAG}_silent"
     stream: Any = create(kind, name, SHAPE, "u2")
     try:
@@ -162,7 +165,8 @@ def test_a_silent_stream_times_out_and_states_who_to_ask(kind: str) -> None:
         stream.close()
 
 
-def test_signed_and_floating_streams_become_counts() -> None:
+def test_signed_and_floating_streams_become_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stream_camera, "_RATE_TIMEOUT_S", 0.05)
     name = f"{TAG}_dark"
     stream = create("milk", name, SHAPE, "i4")
     try:
