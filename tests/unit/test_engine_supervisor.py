@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from escape_hw.config.loader import load_system
-from escape_hw.remote.state import ProductEntry, State
+from escape_hw.remote.state import ProductEntry, RecordingState, State
 from escape_hw.server.engine.product_store import ProductStore
 from escape_hw.server.frontend import engine_supervisor
 from escape_hw.server.frontend.engine_supervisor import EngineSupervisor
@@ -70,3 +70,15 @@ def test_a_silent_engine(monkeypatch: pytest.MonkeyPatch, engine_pid: int, peak:
     supervisor = supervise(monkeypatch, state)
     supervisor.check(0.0)
     assert supervisor.running_engine.killed is killed
+
+
+def test_a_recording_ends_with_its_engine(monkeypatch: pytest.MonkeyPatch) -> None:
+    state = State(engine_pid=PID, recording=RecordingState(recording=True, path="here", written=100))
+    supervisor = supervise(monkeypatch, state)
+    published: list[State] = []
+    supervisor._published.update = published.append
+    supervisor._publish_fault("the engine died")
+    recording = published[-1].recording
+    assert not recording.recording
+    assert (recording.path, recording.written) == ("here", 100)
+    assert "the engine has ended" in recording.fault

@@ -241,6 +241,10 @@ class EngineSupervisor:
         state = self._published.state
         lost = {"health": DeviceHealth.LOST, "facts": {}, "message": "the engine has ended"}
         devices = tuple(one.model_copy(update=lost) for one in state.devices)
+        recording = state.recording
+        if recording.recording:
+            ended = {"recording": False, "fault": "the engine has ended; what was written before is kept"}
+            recording = recording.model_copy(update=ended)
         self._published.update(
             state.model_copy(
                 update={
@@ -248,7 +252,7 @@ class EngineSupervisor:
                     "latency": LatencyState(), "phase": Phase.FAULT, "active_run": None, "streams": (),
                     "engine_pid": 0,
                     "fault": FaultState(reason=reason, at_utc=format_utc(), remedy=_RESTART_REMEDY),
-                    "loop": state.loop.model_copy(update={"closed": False}),
+                    "loop": state.loop.model_copy(update={"closed": False}), "recording": recording,
                 }
             )
         )  # fmt: skip
