@@ -12,13 +12,14 @@ import numpy as np
 import pytest
 from campaign_table import Campaign
 
-from escape_drivers.asm.mirror import AsmMirror, make_asm
+from escape_drivers.asm.mirror import AsmMirror
 from escape_drivers.pi.modulator import PiModulator
 from escape_drivers.pi.transports import SerialTransport, TcpTransport
 from escape_hw.api.adaptive_secondary import ShellState
 from escape_hw.api.emulator import EmulatorRequest
 from escape_hw.api.modulator import Modulation
 from escape_hw.config.loader import load_system
+from escape_hw.config.registry import DeviceContext
 from escape_hw.errors import DeviceError
 from escape_sim.emulators.asm.emulator import AsmEmulator, make_emulator
 from escape_sim.emulators.e727.controller import E727Controller
@@ -81,7 +82,8 @@ def use_secondary(fault: str) -> str:
 
 def secondary(port: int) -> AsmMirror:
     options = [f"devices.dm.options.{key}" for key in (f"port={port}", "reply_s=1.0", "heartbeat_s=600.0")]
-    return make_asm("dm", load_system("maps-nir", overrides=["devices.dm.mode=hardware", *options]), {})
+    config = load_system("maps-nir", overrides=["devices.dm.mode=hardware", *options])
+    return AsmMirror.from_section(config.devices.dm, DeviceContext("dm", config))
 
 
 def test_faults_of_an_adaptive_secondary(campaign: Campaign) -> None:
@@ -121,15 +123,16 @@ class Stage:
             else PtyServer(self.controller, self.faults)
         )
         self._address = self.server.start().partition(" ")[2]
-        options = ["stage.settle_s=0.5", f"wire.timeout_s={TIMEOUT_S}"]
-        section = load_system(
-            "razor-pywfs", overrides=[f"devices.modulator.{option}" for option in options]
-        ).devices.modulator
+        overrides = ["devices.modulator.stage.settle_s=0.5"]
+        section = load_system("razor-pywfs", overrides=overrides).devices.modulator
         assert section is not None
         self._section = section
 
     def driver(self) -> PiModulator:
-        return PiModulator("stage", self._section, self._connect, lambda s: time.sleep(s / HURRY))
+        return PiModulator(
+            "SIMMOD", name="stage", stage=self._section.stage, max_tilt_rad=self._section.max_tilt_rad,
+            connect=self._connect, sleep=lambda s: time.sleep(s / HURRY), timeout_s=TIMEOUT_S,
+        )  # fmt: skip
 
     def _connect(self) -> SerialTransport | TcpTransport:
         host, colon, port = self._address.rpartition(":")

@@ -37,6 +37,9 @@ from escape_hw.runtime.procedures.matrix_input import load_fitting_matrix
         ("report", "absent"),
         ("perf", "no-such-stage"),
         ("nonsense",),
+        ("streams", "--seconds", 1e80),
+        ("emulate", "e727", "--seconds", 1e80),
+        ("modulator", "start", "razor-pywfs", "--seconds", 1e80),
     ],
 )
 def test_bad_usage_exits_2_with_one_line_and_nothing_opened(escape, document, bench, words):

@@ -33,7 +33,8 @@ def emulate(
         typer.Option("--option", metavar="KEY=VALUE", help="Setting of this emulator; repeatable."),
     ] = None,
     seconds: Annotated[
-        float | None, typer.Option("--seconds", min=0, help="Stop after this time (default: at Ctrl-C).")
+        float | None,
+        typer.Option("--seconds", min=0, max=86400, help="Stop after this time (default: at Ctrl-C)."),
     ] = None,
 ) -> None:
     """Emulate a device on its own interface until Ctrl-C; reports errors of clients (exit code 1)."""

@@ -42,7 +42,10 @@ def start(
     seconds: Annotated[
         float | None,
         typer.Option(
-            "--seconds", min=0, help="Modulate for this time, then park (default: keep modulating)."
+            "--seconds",
+            min=0,
+            max=86400,
+            help="Modulate for this time, then park (default: keep modulating).",
         ),
     ] = None,
 ) -> None:

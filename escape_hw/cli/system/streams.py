@@ -29,7 +29,8 @@ def streams(
         bool, typer.Option("--reap", help="Remove shared memory of dead servers.")
     ] = False,
     seconds: Annotated[
-        float | None, typer.Option("--seconds", min=0, help="How long to watch (default: until Ctrl-C).")
+        float | None,
+        typer.Option("--seconds", min=0, max=86400, help="How long to watch (default: until Ctrl-C)."),
     ] = None,
 ) -> None:
     """Show the streams of this computer's servers: rate, size, writer, readers, intervals.
