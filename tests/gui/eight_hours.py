@@ -6,8 +6,6 @@ Run as a process of its own, because the memory of a process contains everything
 from __future__ import annotations
 
 import json
-import os
-import resource
 from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -28,10 +26,14 @@ HOURS, STATES_PER_S, SAMPLE_S = 8, 5, 10
 _REFRESH = 2000
 
 
-def memory_mb() -> float:
-    """Resident memory of this process."""
-    pages = int(Path("/proc/self/statm").read_text().split()[1])
-    return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
+def memory_mb(name: str = "VmRSS") -> float:
+    """Resident memory of this process, or its largest (``VmHWM``).
+
+    That of ``getrusage`` includes the process that started this one.
+    """
+    lines = Path("/proc/self/status").read_text().splitlines()
+    (kilobytes,) = (line.split()[1] for line in lines if line.startswith(f"{name}:"))
+    return 1024 * int(kilobytes) / 1e6
 
 
 def feed(source: ScriptedSource, session: Session, set_time: Callable[[float], None], refresh) -> None:
@@ -85,7 +87,7 @@ def main() -> None:
     print(
         json.dumps({
             "start_mb": start_mb, "end_mb": memory_mb(), "states": n_states,
-            "peak_mb": 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6,
+            "peak_mb": memory_mb("VmHWM"),
         })
     )  # fmt: skip
     dispose(window)
