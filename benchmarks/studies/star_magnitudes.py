@@ -5,7 +5,8 @@
 
 Both matrices come from the same frames. Each seed is a twin with a mirror and turbulence of its own, the
 same at all magnitudes, and each matrix is closed at its own best gain on equal turbulence
-(``loop_comparison.py``). A calibration that is refused counts as a Strehl ratio of zero, its message is kept.
+(``loop_comparison.py``): ESCAPE's scaled by its optical gains, or as calibrated where these are refused. A
+calibration that is refused counts as a Strehl ratio of zero, its message is kept.
 Prints the table and draws ``SYSTEM.png`` beside the raw tables ``SYSTEM-MAGNITUDE.jsonl``. A seed takes two
 minutes of an idle core. The other options are those of ``loop_comparison.py``.
 """
@@ -32,15 +33,25 @@ from realisation_tables import Line, each_realisation
 from escape_hw.errors import CalibrationError
 from escape_hw.report.figures.style import SERIES, legend, new_figure, style_axes
 
-NAMES = (ESCAPE + GAINS, DOCRIME)
+NAMES = (ESCAPE, DOCRIME)
 
 
 def measure_or_refuse(options: argparse.Namespace, number: int, until: float) -> Line:
-    """The line of a seed; with the message instead of values where the calibration is refused."""
-    try:
-        return {**measure_seed(options, number, until), "refused": ""}
-    except CalibrationError as error:
-        return {"registrations": [], "strehl": dict.fromkeys(NAMES, 0.0), "refused": str(error)}
+    """The line of a seed; without optical gains where these are refused, empty where the calibration is."""
+    refused = ""
+    for gains in (True, False):
+        try:
+            now = argparse.Namespace(**{**vars(options), "gains": gains})
+            return {**measure_seed(now, number, until), "refused": refused}
+        except CalibrationError as error:
+            refused = str(error)
+    return {"registrations": [], "strehl": {ESCAPE: 0.0, DOCRIME: 0.0}, "refused": refused}
+
+
+def strehl(row: Line, name: str) -> float:
+    """Strehl ratio in %, with optical gains if they were found."""
+    found: dict[str, float] = row["strehl"]
+    return found.get(name + GAINS, found.get(name, 0.0)) if name == ESCAPE else found[name]
 
 
 def shift_errors(rows: list[Line]) -> tuple[list[float], list[float]]:
@@ -58,7 +69,7 @@ def print_table(tables: dict[float, list[Line]]) -> None:
     print(f"| magnitude | {' | '.join(NAMES)} | difference | converged | shift, rms error | stated |")
     print("|---" * (5 + len(NAMES)) + "|")
     for magnitude, rows in tables.items():
-        values = [np.array([row["strehl"][name] for row in rows]) for name in NAMES]
+        values = [np.array([strehl(row, name) for row in rows]) for name in NAMES]
         errors, sigmas = shift_errors(rows)
         print(
             f"| {magnitude:g} | {' | '.join(f'{one.mean():.1f}' for one in values)} | "
@@ -70,9 +81,9 @@ def print_table(tables: dict[float, list[Line]]) -> None:
 def _draw_strehl(axes: Axes, tables: dict[float, list[Line]]) -> None:
     for name, colour in zip(NAMES, SERIES, strict=False):
         for magnitude, rows in tables.items():
-            values = [row["strehl"][name] for row in rows]
+            values = [strehl(row, name) for row in rows]
             axes.plot([magnitude] * len(values), values, ".", color=colour, ms=4, alpha=0.5)
-        means = [np.mean([row["strehl"][name] for row in rows]) for rows in tables.values()]
+        means = [np.mean([strehl(row, name) for row in rows]) for rows in tables.values()]
         axes.plot(list(tables), means, "-", color=colour, label=name)
     axes.set(xlabel="magnitude of the star", ylabel="Strehl ratio [%]", ylim=(0, None))
     legend(axes)
@@ -106,9 +117,9 @@ def main() -> None:
         )
     print_table(tables)
     figure = new_figure(8.0, 3.2)
-    strehl, shift = figure.subplots(1, 2)
-    _draw_strehl(style_axes(strehl), tables)
-    _draw_shift(style_axes(shift), tables)
+    left, right = figure.subplots(1, 2)
+    _draw_strehl(style_axes(left), tables)
+    _draw_shift(style_axes(right), tables)
     figure.savefig(folder / f"{options.system}.png", dpi=110, facecolor="white")
 
 
