@@ -92,8 +92,8 @@ def _draw_strehl(axes: Axes, tables: dict[float, list[Line]]) -> None:
 def _draw_shift(axes: Axes, tables: dict[float, list[Line]]) -> None:
     found = [shift_errors(rows) for rows in tables.values()]
     for k, (label, line) in enumerate((("rms error", "o-"), ("stated", "--"))):
-        axes.semilogy(list(tables), [_rms(pair[k]) for pair in found], line, color=SERIES[0], label=label)
-    axes.set(xlabel="magnitude of the star", ylabel="shift [% of a sub-aperture]")
+        axes.plot(list(tables), [_rms(pair[k]) for pair in found], line, color=SERIES[0], label=label)
+    axes.set(xlabel="magnitude of the star", ylabel="shift [% of a sub-aperture]", ylim=(0, None))
     legend(axes)
 
 
