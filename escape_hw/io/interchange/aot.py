@@ -146,7 +146,7 @@ def write_aot(
     make_folder(path.parent)
     try:
         with tempfile.TemporaryDirectory(dir=path.parent, prefix=".aot.") as folder:
-            temporary = Path(folder) / "fits"
+            temporary = Path(folder) / "system.fits"
             system.write_to_file(temporary)
             content = temporary.read_bytes()
     except OSError as error:
