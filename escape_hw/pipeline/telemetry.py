@@ -76,7 +76,7 @@ def power_spectra(
     """
     longest = max(len(data) // _N_SEGMENTS, _MIN_SEGMENT)
     segment = min(2 ** int(np.log2(longest)), _MAX_SEGMENT, len(data))
-    # Imported in half the time of a command, and needed when a recording is analysed only.
+    # Here: its import takes as long as half a short command, and only the analysis of recordings needs it.
     from scipy import signal
 
     frequency, density = signal.welch(data, rate_hz, nperseg=segment, axis=0)

@@ -83,8 +83,10 @@ class ServerJournal:
         notes = []
         if (stale := self._stale_journal()) is not None:
             self.last_run_id = int(stale.get("last_run_id", 0))
-            with contextlib.suppress(TypeError, ValidationError):
+            try:
                 self.products = tuple(ProductEntry.model_validate(one) for one in stale.get("products", ()))
+            except (TypeError, ValidationError) as error:
+                log.warning("the journal is damaged, products are not offered again: %s", error)
             notes.append(f"the previous server (process {stale.get('pid')}) did not end cleanly; {RESET}")
             if (run := stale.get("run")) is not None:
                 notes.append(_describe_run(run))
