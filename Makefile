@@ -28,6 +28,7 @@ run: $(VENV)/run.stamp ## Calibrate the simulated RAZOR bench, close the loop, w
 	$(BIN)/escape reproduce shwfs $(ARGS)
 
 test: $(VENV)/test.stamp ## Run the tests
+	@$(BIN)/python tests/system_packages.py --window
 	$(ONE_THREAD) $(BIN)/python -m pytest $(WORKERS) $(ARGS)
 
 test-all: $(VENV)/all.stamp ## Run every test, also the slow ones, with all optional packages

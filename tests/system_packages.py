@@ -1,7 +1,9 @@
 """Programs and libraries of the system that optional tests need: which are missing, and how to get them.
 
-``python tests/system_packages.py [--install]``. Installs with apt if it runs as root and apt works; otherwise
-it says what to type. The tests that need what is missing are skipped, so its exit code is always 0.
+``python tests/system_packages.py [--install | --window]``. ``--install`` installs with apt if it runs as root
+and apt works; otherwise it says what to type. The tests that need what is missing are skipped, so its exit
+code is 0. ``--window`` looks only for the libraries that Qt loads, without which pytest cannot start, and
+exits with 1 where they are missing.
 """
 
 from __future__ import annotations
@@ -30,8 +32,11 @@ def has_postgres() -> bool:
     return bool(shutil.which("initdb") or list(Path("/usr/lib/postgresql").glob("*/bin/initdb")))
 
 
-QT = ("libEGL.so.1", "libGL.so.1", "libxkbcommon.so.0", "libfontconfig.so.1", "libdbus-1.so.3")
-QT_PACKAGES = ("libegl1", "libgl1", "libxkbcommon0", "libfontconfig1", "libdbus-1-3")
+QT = (
+    "libglib-2.0.so.0", "libEGL.so.1", "libGL.so.1", "libxkbcommon.so.0", "libfontconfig.so.1",
+    "libdbus-1.so.3",
+)  # fmt: skip
+QT_PACKAGES = ("libglib2.0-0", "libegl1", "libgl1", "libxkbcommon0", "libfontconfig1", "libdbus-1-3")
 X11 = (
     "libxcb-cursor.so.0", "libxcb-icccm.so.4", "libxcb-image.so.0", "libxcb-keysyms.so.1",
     "libxcb-render-util.so.0", "libxkbcommon-x11.so.0",
@@ -75,8 +80,19 @@ def install(packages: list[str]) -> bool:
     return True
 
 
+def check_window() -> None:
+    """Stop if Qt cannot be loaded."""
+    if not can_load(*QT):
+        sys.exit(
+            f"the tests need the libraries that Qt loads; as root: apt-get install {' '.join(QT_PACKAGES)}"
+        )
+
+
 def main() -> None:
     """Say what is missing, and install it if asked to."""
+    if "--window" in sys.argv[1:]:
+        check_window()
+        return
     missing = [(what, packages) for what, is_there, packages in NEEDED if not is_there()]
     names = [name for _, packages in missing for name in packages]
     for what, packages in missing:

@@ -62,7 +62,8 @@ def test_resume_of_a_finished_sweep_shows_its_result(
 ):
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
     there = conclude_in(tmp_path / where, description)
-    description.open_study().set_result_folder(str(there))
+    with description.open_study() as study:
+        study.set_result_folder(str(there))
     before = sorted(path.name for path in tmp_path.iterdir())
     code, out, err = escape("sweep", "--resume", tmp_path / "run", "--out", tmp_path / "again")
     assert code == 0
@@ -76,5 +77,6 @@ def test_resume_of_a_finished_sweep_shows_its_result(
 
 
 def test_a_result_that_has_gone_is_made_again(description: SweepDescription, tmp_path: Path) -> None:
-    description.open_study().set_result_folder(str(tmp_path / "gone"))
+    with description.open_study() as study:
+        study.set_result_folder(str(tmp_path / "gone"))
     assert find_finished_result(tmp_path / "run", description) is None

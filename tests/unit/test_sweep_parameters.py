@@ -109,7 +109,8 @@ def test_a_sweep_on_an_open_bench(tmp_path):
         ).validate()
         description.save(tmp_path)
         assert read_description(tmp_path) == description
-        found = run(run_sweep(description.open_study(), bench), observers=(sent.append,))
+        with description.open_study() as study:
+            found = run(run_sweep(study, bench), observers=(sent.append,))
         assert np.all(bench.dm.shape == 0)
     result = analyse_sweep(swept, found, 0.05)
     assert len(found.records) == 4 + 2 + 12

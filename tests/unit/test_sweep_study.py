@@ -21,13 +21,18 @@ OUTCOME = {"strehl": None, "stable": True, "diverged": False}
 
 @pytest.fixture
 def opened(tmp_path):
+    made = []
+
     def make(settings: str = "same", heartbeat: bool = True, **options) -> SweepStudy:
         url = f"sqlite:///{tmp_path / 'study.db'}"
         options = {"timeout_s": 5.0, **options}
         sweep = Sweep("", VARIANTS, SPACE, Design(), 100, 1, simulated=heartbeat)
-        return SweepStudy(sweep, url, "s", {"frames": settings}, **options)
+        made.append(SweepStudy(sweep, url, "s", {"frames": settings}, **options))
+        return made[-1]
 
-    return make
+    yield make
+    for one in made:
+        one.close()
 
 
 def run_all(*studies: SweepStudy, plan=PLAN, merit=lambda slot, values: 0.1 + values["gain"]) -> list[Slot]:

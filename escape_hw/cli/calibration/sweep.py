@@ -239,7 +239,8 @@ def _save(
     if result.partial:
         context.notify(f"resume with: {shlex.join(['escape', 'sweep', '--resume', str(folder.path)])}")
     else:
-        description.open_study().set_result_folder(str(folder.path))
+        with description.open_study() as study:
+            study.set_result_folder(str(folder.path))
 
 
 def _show(context: CommandContext, document: Mapping[str, Any]) -> None:

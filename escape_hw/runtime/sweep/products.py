@@ -151,8 +151,10 @@ def find_finished_result(run: Path, description: SweepDescription) -> dict[str, 
     StorageError
         The study's storage does not answer.
     """
-    elsewhere = None if _is_finished(run) else description.open_study().result_folder()
-    folder = run if elsewhere is None else Path(elsewhere)
+    folder = run
+    if not _is_finished(run):
+        with description.open_study() as study:
+            folder = Path(study.result_folder() or run)
     if not _is_finished(folder):
         return None
     document = read_result(folder)

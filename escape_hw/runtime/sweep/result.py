@@ -123,7 +123,8 @@ def analyse_sweep(sweep: Sweep, run: SweepRun, margin: float = DEFAULT_MARGIN) -
 def sweep_and_analyse(description: SweepDescription, runner: Workers | Bench) -> Procedure[SweepResult]:
     """Run a sweep, see :func:`~escape_hw.runtime.sweep.run.run_sweep`, close its workers, and analyse it."""
     try:
-        run = yield from run_sweep(description.open_study(), runner)
+        with description.open_study() as study:
+            run = yield from run_sweep(study, runner)
     finally:
         if isinstance(runner, Workers):
             runner.close()

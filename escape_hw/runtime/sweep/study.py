@@ -15,7 +15,7 @@ import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from datetime import datetime
-from typing import Any, Concatenate, ParamSpec, TypeVar
+from typing import Any, Concatenate, ParamSpec, Self, TypeVar
 
 import optuna
 from optuna.exceptions import ExperimentalWarning, StorageInternalError, UpdateFinishedTrialError
@@ -125,8 +125,22 @@ class SweepStudy:
         optuna.logging.set_verbosity(optuna.logging.ERROR)
         # Optuna announces the interface of its heartbeats as experimental, from several threads.
         warnings.filterwarnings("ignore", ".*(heartbeat|fail_stale_trials)", ExperimentalWarning)
-        self._study = self._retry(lambda: _open_study(url, name, sweep.simulated))
-        self._check_settings(dict(settings))
+        self._storage, self._study = self._retry(lambda: _open_study(url, name, sweep.simulated))
+        try:
+            self._check_settings(dict(settings))
+        except BaseException:
+            self.close()
+            raise
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the connections to the storage."""
+        self._storage.engine.dispose()
 
     def stop(self) -> None:
         """End the wait for a storage that does not answer, in every thread."""
@@ -346,7 +360,7 @@ def redact_password(url: str) -> str:
         return url
 
 
-def _open_study(url: str, name: str, heartbeat: bool) -> optuna.Study:
+def _open_study(url: str, name: str, heartbeat: bool) -> tuple[_Storage, optuna.Study]:
     # A locked file is waited for; a connection that a restarted server has cut is noticed.
     options: dict[str, Any] = {"pool_pre_ping": True}
     if url.startswith("sqlite"):
@@ -364,7 +378,13 @@ def _open_study(url: str, name: str, heartbeat: bool) -> optuna.Study:
     if url.startswith("sqlite"):
         event.listen(storage.engine, "connect", _enable_write_ahead_log)
         storage.engine.dispose()
-    return optuna.create_study(storage=storage, study_name=name, direction="maximize", load_if_exists=True)
+    try:
+        return storage, optuna.create_study(
+            storage=storage, study_name=name, direction="maximize", load_if_exists=True
+        )
+    except BaseException:
+        storage.engine.dispose()
+        raise
 
 
 def _enable_write_ahead_log(connection: Any, _record: object) -> None:
