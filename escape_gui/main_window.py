@@ -56,6 +56,7 @@ from escape_gui.window.docks import (
 from escape_gui.window.export import Exporter
 from escape_gui.window.header import (
     AlarmBanner,
+    BannerStack,
     ControlBanner,
     FaultBanner,
     FrozenBanner,
@@ -302,7 +303,8 @@ class MainWindow(QMainWindow):
         banners = (
             self.fault_banner, self.alarm_banner, self.control_banner, self.frozen_banner, self.server_banner,
         )  # fmt: skip
-        column(bar, self.header, *banners, parent=top, spacing=0)
+        self._banners = BannerStack(banners)
+        column(bar, self.header, self._banners, parent=top, spacing=0)
         self.setMenuWidget(top)
 
     # ------------------------------------------------------------ layout
@@ -366,6 +368,7 @@ class MainWindow(QMainWindow):
 
     def resizeEvent(self, event: QResizeEvent) -> None:
         super().resizeEvent(event)
+        self._banners.fit()
         QTimer.singleShot(0, self, self._change_layout)
 
     def show_workspace(self, name: str) -> None:
@@ -430,6 +433,7 @@ class MainWindow(QMainWindow):
         self.header.show_state(state, connected=now.connected, live=now.live, mine=now.may_write)
         self.fault_banner.show_state(state)
         self.control_banner.show_state(state, offered=now.connected and now.live and not now.may_write)
+        self._banners.fit()
         for one in ACTIONS:
             reason = one.unavailable(now)
             action = self.actions_by_name[one.name]

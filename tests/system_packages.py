@@ -39,11 +39,11 @@ QT = (
 QT_PACKAGES = ("libglib2.0-0", "libegl1", "libgl1", "libxkbcommon0", "libfontconfig1", "libdbus-1-3")
 X11 = (
     "libxcb-cursor.so.0", "libxcb-icccm.so.4", "libxcb-image.so.0", "libxcb-keysyms.so.1",
-    "libxcb-render-util.so.0", "libxkbcommon-x11.so.0",
+    "libxcb-render-util.so.0", "libxcb-shape.so.0", "libxkbcommon-x11.so.0",
 )  # fmt: skip
 X11_PACKAGES = (
     "xvfb", "libxcb-cursor0", "libxcb-icccm4", "libxcb-image0", "libxcb-keysyms1", "libxcb-render-util0",
-    "libxkbcommon-x11-0",
+    "libxcb-shape0", "libxkbcommon-x11-0",
 )  # fmt: skip
 #: What the tests need, how to look for it, and the packages of Debian that bring it.
 NEEDED: tuple[tuple[str, Callable[[], object], tuple[str, ...]], ...] = (

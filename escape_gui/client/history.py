@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from escape_hw.remote.state import State
 
-#: Number of states that are kept: 12 hours at five states a second, 14 MB.
+#: Number of states that are kept: 12 hours at five states a second, 14 MB when full.
 HISTORY_SIZE = 12 * 3600 * 5
 #: Interval between two states from which the curves have a gap, seconds.
 _GAP_S = 2.0
@@ -20,8 +20,8 @@ class TimeSeriesBuffer:
     """Times and values of the last ``size`` entries."""
 
     def __init__(self, size: int) -> None:
-        self._times = np.full(2 * size, np.nan)
-        self._values = np.full(2 * size, np.nan)
+        # Memory that nothing was written to is not taken from the system.
+        self._times, self._values = np.empty(2 * size), np.empty(2 * size)
         self._size, self._end = size, 0
 
     def add(self, time: float, value: float) -> None:

@@ -116,20 +116,17 @@ class ArgumentForm(QWidget):
         }
 
     def set_matrix_choices(self, matrices: tuple[str, ...]) -> None:
-        """Replace the matrices to choose from; a choice that still exists is kept."""
+        """Replace the matrices to choose from; a choice is kept, otherwise the newest is the default."""
         if matrices == self._matrices:
             return
         self._matrices = matrices
         for one in self._parameters:
             field = self.fields[one.name]
             if one.kind == "matrix" and isinstance(field, QComboBox):
-                now, first = field.currentText(), field.count() == 1
                 field.blockSignals(True)
                 field.clear()
                 field.addItems([form_text.NO_CHOICE, *matrices])
-                # A procedure about a matrix takes the newest one by default.
-                wanted = now if now in matrices and not first else self._default_matrix(one)
-                field.setCurrentText(wanted)
+                field.setCurrentText(self._default_matrix(one))
                 field.blockSignals(False)
                 self._restore(one)
         self.edited.emit()

@@ -5,9 +5,17 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 
-from PySide6.QtCore import QSize, Qt
+from PySide6.QtCore import QEvent, QObject, QSize, Qt
 from PySide6.QtGui import QAction, QResizeEvent
-from PySide6.QtWidgets import QApplication, QHBoxLayout, QLabel, QPushButton, QSizePolicy, QWidget
+from PySide6.QtWidgets import (
+    QApplication,
+    QHBoxLayout,
+    QLabel,
+    QPushButton,
+    QScrollArea,
+    QSizePolicy,
+    QWidget,
+)
 
 from escape_gui.client.availability import UNKNOWN_VALUE, has_engine, has_frames, is_measured
 from escape_gui.client.connection import CLIENT_NAME
@@ -253,6 +261,51 @@ class Banner(QWidget):
             self.text.setText(text)
         # After the text was set: the height depends on it.
         self.setVisible(bool(text))
+
+
+class BannerStack(QScrollArea):
+    """Banners above each other, the most severe first; they scroll where they would displace the panels."""
+
+    #: Most of the window's height for more than the first banner.
+    _MOST = 1 / 6
+
+    def __init__(self, banners: Sequence[Banner]) -> None:
+        super().__init__()
+        self._banners = banners
+        self.setWidgetResizable(True)
+        self.setFrameShape(QScrollArea.Shape.NoFrame)
+        self.setFocusPolicy(Qt.FocusPolicy.NoFocus)
+        self.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
+        content = QWidget()
+        column(*banners, parent=content, spacing=0)
+        self.setWidget(content)
+        content.installEventFilter(self)
+
+    def eventFilter(self, watched: QObject, event: QEvent) -> bool:
+        # A banner was shown or hidden, or its text has changed.
+        if event.type() == QEvent.Type.LayoutRequest:
+            self.fit()
+        return super().eventFilter(watched, event)
+
+    def fit(self) -> None:
+        """Take the height of the visible banners, or as much as the window has for them."""
+        width = self.viewport().width()
+        heights = [
+            max(one.heightForWidth(width), one.sizeHint().height())
+            for one in self._banners
+            if not one.isHidden()
+        ]
+        wanted = (
+            min(sum(heights), max(round(self._MOST * self.window().height()), heights[0])) if heights else 0
+        )
+        if wanted != self.height():
+            self.setFixedHeight(wanted)
+            # At once, for who clicks a button as soon as it is there.
+            content, layout = self.widget(), self.window().layout()
+            if layout is not None:
+                layout.activate()
+            if content is not None:
+                content.resize(width, max(sum(heights), wanted))
 
 
 class ControlBanner(Banner):

@@ -21,6 +21,7 @@ from PySide6.QtWidgets import (
 from pytestqt.qtbot import QtBot
 from scripted import LEASE, ScriptedControl, ScriptedSource
 
+from escape_gui.client.alarms import LimitMonitor
 from escape_gui.client.session import EmptySource, Session
 from escape_gui.main_window import MainWindow
 from escape_gui.panels.base import ENGINE_ENDED_TEXT
@@ -476,9 +477,9 @@ def test_a_window_without_a_source_starts(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("scale", [pytest.param(1.0, marks=pytest.mark.slow), 1.4])
 def test_the_window_fits_a_small_screen(
-    make_window: MakeWindow, source: ScriptedSource, scale: float
+    make_window: MakeWindow, source: ScriptedSource, scale: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """1366 x 768 with a task bar, also with the fault banner."""
+    """1366 x 768 with a task bar, also with all banners, of which the fault stays in view."""
     source.entries = (
         ProcedureEntry(
             name="escape",
@@ -491,6 +492,11 @@ def test_the_window_fits_a_small_screen(
     source.change(last_run=ended)
     source.fail()
     window = make_window(settings=Settings(font_scale=scale))
+    window.resize(1366, 700)
+    monkeypatch.setattr("escape_gui.window.header.control_offer", lambda _: "No operator has control")
+    monkeypatch.setattr(LimitMonitor, "unacknowledged", [f"alarm {k}" for k in range(5)])
+    window.frozen_banner.show_frozen("12:00:00")
+    window.server_banner.show_text("connected to a server")
     window.update_timer.tick(force=True)
     for one in WORKSPACES:
         window.show_workspace(one.name)
@@ -500,6 +506,8 @@ def test_the_window_fits_a_small_screen(
         assert window.minimumSizeHint().height() <= 700, one.name
         window.resize(round(1366 * scale), 700)
         assert window.height() == 700
+        assert not window.fault_banner.visibleRegion().isEmpty()
+        assert window.alarm_banner.isVisible()
 
 
 def test_no_tab_bar_of_another_workspace_remains(make_window: MakeWindow) -> None:

@@ -90,10 +90,11 @@ def write_run_result(folder: RunFolder, document: Mapping[str, Any]) -> dict[str
     An aborted run gets no report, because that takes seconds; ``escape report`` builds it.
     """
     document = {**document, "verdict": verdict_document(document)}
-    if not document.get("partial"):
-        folder.add_product("report", folder.file(REPORT))
     folder.write_result(document)
     if not document.get("partial"):
+        # Named when it is there: the process may end while it is built.
         write_report(folder.path)
+        folder.add_product("report", folder.file(REPORT))
+        folder.write_result(document)
     products = {name: str(path) for name, path in folder.products.items()}
     return {**document, **folder.location_fields(), "products": products}
