@@ -546,6 +546,17 @@ def test_new_matrices_are_offered_to_the_form(form, source):
     assert box.currentText() == "first"
 
 
+def test_the_newest_matrix_is_the_default_also_when_those_of_a_run_arrive_one_by_one(form, source):
+    panel = form.panels["procedure"]
+    look(form)
+    panel.choice.setCurrentIndex(1)
+    for name in ("escape-1-docrime", "escape-1"):
+        entry = ProductEntry(name=name, kind="matrix", path="/x.fits")
+        source.change(products=(*source.state.products, entry))
+        look(form)
+        assert panel.form.fields["im"].currentText() == name
+
+
 def test_without_control_nothing_starts(session, source, control, form):
     source.change(lease=None)
     look(form)
