@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 
 from small_system import configuration
@@ -59,7 +60,7 @@ def finished(database: Path) -> dict[int, str]:
     """Numbers of the finished trials in an SQLite study, with what they found."""
     if not database.is_file():
         return {}
-    with sqlite3.connect(f"file:{database}?mode=ro", uri=True, timeout=30) as connection:
+    with closing(sqlite3.connect(f"file:{database}?mode=ro", uri=True, timeout=30)) as connection:
         try:
             rows = connection.execute(
                 "select t.number, a.value_json from trials t join trial_user_attributes a using (trial_id) "
@@ -73,7 +74,7 @@ def finished(database: Path) -> dict[int, str]:
 
 def states(database: Path) -> dict[str, int]:
     """Trials by state in an SQLite study."""
-    with sqlite3.connect(f"file:{database}?mode=ro", uri=True) as connection:
+    with closing(sqlite3.connect(f"file:{database}?mode=ro", uri=True)) as connection:
         return dict(connection.execute("select state, count(*) from trials group by state").fetchall())
 
 
