@@ -300,7 +300,7 @@ class BannerStack(QScrollArea):
         )
         if wanted != self.height():
             self.setFixedHeight(wanted)
-            # At once, for who clicks a button as soon as it is there.
+            # Without this, a click before the next event loop misses the button.
             content, layout = self.widget(), self.window().layout()
             if layout is not None:
                 layout.activate()
