@@ -10,7 +10,7 @@ from pipe import TIMEOUT_S, Peers
 
 from escape_hw.api.modulator import Modulation
 from escape_hw.errors import DeviceError
-from escape_sim.emulators.e727.transports import FAULT_KINDS
+from escape_sim.emulators.e727.transports import FAULT_KINDS, FaultInjector
 
 CIRCLE = Modulation(1.41e-4, 303.03)
 #: What a message tells the operator to do.
@@ -66,6 +66,8 @@ def check(kind: str, at: int) -> None:
     happened = at < len(peers.controller.received_commands)
     if happened and kind in ("close", "reset", "power_cut", "stall"):
         assert failures, (kind, at, "a lost link must be told")
+    if not happened:
+        peers.wire = FaultInjector()
     # Whatever happened: the next opening finds everything in order, and leaves it at rest.
     peers.wire.is_stalled = False
     with peers.driver() as again:
