@@ -116,7 +116,11 @@ def injected(truth, *more, seed):
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [3, 1])
 def test_a_sheared_mirror_is_found_beside_the_registration(number):
-    """Without the shear among the fitted parameters the slopes are explained less well."""
+    """A shear among the fitted parameters keeps its value, and the registration its accuracy.
+
+    The mean square misfit is not compared with a fit without it: the positions of the actuators, which are
+    fitted too, take up most of a shear of this size, and over eight seeds either was smaller four times.
+    """
     truth = random_registration(number)
     with injected(truth, 'calibration.extra_parameters=["anamorphosis"]', seed=number) as bench:
         found, start = looked(bench, 4, 500)
@@ -128,9 +132,6 @@ def test_a_sheared_mirror_is_found_beside_the_registration(number):
     assert abs(shear.value - before.value) < 3 * before.sigma
     # The errors of the live estimate do not contain those of the model.
     assert abs(shear.value - SHEAR) < 4 * np.hypot(shear.sigma, before.sigma)
-    with injected(truth, seed=number) as bench:
-        plain = looked(bench, 4, 500)[0]
-    assert found.misfit < plain.misfit
 
 
 @pytest.mark.slow
