@@ -109,8 +109,9 @@ class LiveRegistration:
         The synthetic model on the same sub-apertures.
     start
         Initial registration, within the linear range of SPRINT. Small pokes hardly determine the width of
-        the influence functions, so it is a prior, as are the fitted extra parameters. The actuator
-        corrections are those of the matrices at the live registration.
+        the influence functions, so it is a prior, as are the fitted extra parameters. The scatter of
+        actuators and slopes is estimated from the blocks. The actuator corrections are those of the matrices
+        at the live registration.
     order, lags
         Order of the whitening filter and length of the temporal response, in frames.
     memory
@@ -174,7 +175,8 @@ class LiveRegistration:
         TooFewFrames
             Too few frames with a known history.
         """
-        if self._updates < 2 or self._updates % _WHITEN_EVERY == 0:
+        learning = self._updates < 2 or self._updates % _WHITEN_EVERY == 0
+        if learning:
             self._whiten(data, start)
         block = self._filter_block(data, start)
         self._weights.add(block, self._current_matrix)
@@ -183,12 +185,16 @@ class LiveRegistration:
         if self._state is None:
             # The residual for the matrix in use includes its error: fit once for the noise.
             self._add_block(block, delayed)
-            self._state = self._gauss_newton()[2]
+            problem, system, self._state = self._gauss_newton()
+            self._priors = problem.estimate_priors(self._state, system).priors
             self._current_matrix, self._sums = self._matrix, ForgettingSums.zeros(*self._template.data.shape)
         block_sums = self._add_block(block, delayed)
         problem, system, self._state = self._gauss_newton()
         self._updates += 1
-        return self._build_estimate(problem, system, self._state, block_sums, response)
+        found = self._build_estimate(problem, system, self._state, block_sums, response)
+        if learning:
+            self._priors = problem.estimate_priors(self._state, system).priors
+        return found
 
     def _add_block(self, block: FilteredTelemetry, delayed: NDArray[np.float32]) -> ForgettingSums:
         """Apply the forgetting factor, add a block, and return the sums of the block alone."""
