@@ -53,19 +53,25 @@ def commands(change):
     return happen
 
 
-def die(shape):
-    left = shape.copy()
-    left[DEAD] = 0.0
-    return left
+def weaken(gain):
+    """Leave one actuator with this share of its gain."""
+
+    def change(shape):
+        left = shape.copy()
+        left[DEAD] *= gain
+        return left
+
+    return commands(change)
 
 
-def test_a_failed_actuator_is_named_and_nothing_exchanged_for_it(start):
-    # Pokes this small name it when half of the memory's frames are from after its death.
-    found = followed(start, commands(die), seconds=AT + 8)
+@pytest.mark.parametrize("gain", [0.0, 0.15])
+def test_a_failed_actuator_is_named_and_nothing_exchanged_for_it(start, gain):
+    # Pokes this small name it when half of the memory's frames are from after its failure.
+    found = followed(start, weaken(gain), seconds=AT + 8)
     assert [alarm.kind for alarm in found.alarms] == ["actuator"]
     alarm = found.alarms[0]
     assert alarm.text.startswith(f"actuator {DEAD} ")
-    assert alarm.seconds > AT
+    assert AT < alarm.seconds <= AT + 7
     assert not [one for one in found.exchanges if one.accepted and one.seconds > AT + 1]
     apart = found.column("shift_x")[-1] - start.registration.registration.shift_x
     assert abs(apart) < 2.0
