@@ -218,9 +218,11 @@ class _Bootstrap:
         """Open an unstable loop and reduce its gain; raises after :data:`_MAX_RETRIES` reductions."""
         self._retries += 1
         if self._retries > _MAX_RETRIES:
-            reason = "diverged" if segment.diverged else (segment.reason or "oscillates")
+            reason = "it diverged" if segment.diverged else "it oscillates"
+            if segment.reason and not segment.diverged:
+                reason = f"no gains can be measured ({segment.reason})"
             raise CalibrationError(
-                f"the loop does not stay closed: at an effective gain of {self._gain:.2f} it {reason}; "
+                f"the loop does not stay closed: at an effective gain of {self._gain:.2f} {reason}; "
                 "lower loop.gain, drop more modes, or measure the matrix again"
             )
         self._gain *= _GAIN_REDUCTION
