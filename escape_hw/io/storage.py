@@ -14,21 +14,22 @@ from escape_hw.errors import StorageError
 #: Free space that must remain after writing a file, in bytes.
 MARGIN_BYTES = 1 << 20
 
+_ELSEWHERE = "choose another folder (--out on a command line)"
 _REMEDIES = {
-    errno.ENOSPC: "free some space or choose another folder (--out on a command line)",
-    errno.EDQUOT: "your quota is used up; free some space or choose another folder (--out on a command line)",
-    errno.EFBIG: "files of this size are not allowed here; choose another folder (--out on a command line)",
-    errno.EACCES: "you may not write there; choose another folder (--out on a command line)",
-    errno.EPERM: "you may not write there; choose another folder (--out on a command line)",
-    errno.EROFS: "the file system is read-only; choose another folder (--out on a command line)",
-    errno.ENOTDIR: "a part of the path is a file; choose another folder (--out on a command line)",
+    errno.ENOSPC: "free some space or " + _ELSEWHERE,
+    errno.EDQUOT: "your quota is used up; free some space or " + _ELSEWHERE,
+    errno.EFBIG: "files of this size are not allowed here; " + _ELSEWHERE,
+    errno.EACCES: "you may not write there; " + _ELSEWHERE,
+    errno.EPERM: "you may not write there; " + _ELSEWHERE,
+    errno.EROFS: "the file system is read-only; " + _ELSEWHERE,
+    errno.ENOTDIR: "a part of the path is a file; " + _ELSEWHERE,
     errno.EISDIR: "a folder of that name exists; choose another name",
 }
 
 
 def storage_error(path: Path, error: OSError) -> StorageError:
     """Put an operating-system error into words that name the path and the way out."""
-    remedy = _REMEDIES.get(error.errno or 0, "check the disk or choose another folder (--out on a command line)")
+    remedy = _REMEDIES.get(error.errno or 0, "check the disk or " + _ELSEWHERE)
     return StorageError(f"{path}: cannot be written ({error.strerror or error}); {remedy}")
 
 
@@ -61,7 +62,7 @@ def check_space(folder: Path, need_bytes: int) -> None:
     if free < need_bytes + MARGIN_BYTES:
         raise StorageError(
             f"{folder}: {free / 1e6:.1f} MB free, {(need_bytes + MARGIN_BYTES) / 1e6:.1f} MB needed; "
-            "free some space or choose another folder (--out on a command line)"
+            "free some space or " + _ELSEWHERE
         )
 
 
