@@ -44,7 +44,9 @@ T = TypeVar("T")
 #: of all solvers are in this unit.
 MAX_STEP = np.array([60.0, 60.0, 2.0, 4.0, 4.0])
 #: A step is halved, at most so many times, while its cost exceeds the lowest so far by more than this factor.
-_MAX_HALVINGS, _COST_TOLERANCE = 6, 1.02
+#: In a matrix that is mostly noise, 2 % more are a thousand times the square of a standard error: with that
+#: tolerance the width and the shape of the influence functions went astray along their degeneracy.
+_MAX_HALVINGS, _COST_TOLERANCE = 6, 1.001
 #: Oscillating steps are shortened down to this fraction of the learning rate, and so many times; then the
 #: descent gives up.
 _MIN_RATE_FRACTION, _MAX_REVERSALS = 0.125, 12
