@@ -28,11 +28,16 @@ from escape_hw.pipeline.statistics import root_mean_square
 GAIN, WIDTH, SHAPE = 0, 6, 7
 #: Share of a variant below which its derivatives by the registration are taken to be the model's own.
 _SMALL_SHARE = 0.25
-#: Relative gain after a step above which the step of the shares is scaled to keep gain times share linear.
+#: Relative gain after a step above which the step of shares and effects is scaled to keep their product with
+#: the gain linear.
 _MIN_GAIN_RATIO = 0.05
 #: Effects of single actuators, in the order of the unknowns, and the priors of their scatter.
 _ACTUATOR_PRIORS = ("actuator_gain", "actuator_width", "actuator_position", "actuator_position")
 N_ACTUATOR_EFFECTS = len(_ACTUATOR_PRIORS)
+#: Precision of the mean of the actuator gains, relative to that of one: their mean is the common gain. If it
+#: were free, a common gain far too large with all actuators far below it would bring them closer to each
+#: other, which their prior rewards.
+_MEAN_STIFFNESS = 1e3
 #: Limits of the estimated scatter relative to the default priors.
 _MIN_PRIOR_RATIO, _MAX_PRIOR_RATIO = 0.05, 3.0
 #: Relative change of the fitted matrix below which derivatives are kept: they change by about as much. With
@@ -258,6 +263,7 @@ class MixedEffectsProblem:
         system = normal_equations(
             common, self._actuator_derivatives(z, scale, actuator_factor), self.modes, model, residual,
             self.precision, self.offset(state), sampling_derivative, self.lines, self.trends,
+            _MEAN_STIFFNESS * self._actuator_precision("actuator_gain"),
         )  # fmt: skip
         self.kept = z, system
         return system
@@ -362,15 +368,16 @@ class MixedEffectsProblem:
         n_act = self.model.n_act
         counts = self.n_variants, self.n_lines, self.trends.shape[1], N_ACTUATOR_EFFECTS * n_act
         variant, sampling, trend, actuators, slopes = np.split(step[self.first_variant :], np.cumsum(counts))
-        # The matrix is linear in gain times share, so the step is exact in that product.
+        # The matrix is linear in gain times share or effect, so the step is exact in that product.
         gain = state.gain + step[GAIN]
         gain_ratio = state.gain / gain if gain > _MIN_GAIN_RATIO * state.gain else 1.0
         return MixedEffectsState(
             gain, state.alpha + step[1:6],
             float(np.clip(state.width + step[WIDTH], -0.5, 1.0)),
             state.shape + gain_ratio * step[SHAPE : self.first_variant],
-            state.variant + gain_ratio * variant, state.sampling + sampling, state.trend + trend,
-            state.actuator + actuators.reshape(-1, n_act), state.slope_gain + slopes,
+            state.variant + gain_ratio * variant, state.sampling + gain_ratio * sampling,
+            state.trend + gain_ratio * trend, state.actuator + gain_ratio * actuators.reshape(-1, n_act),
+            state.slope_gain + gain_ratio * slopes,
         )  # fmt: skip
 
 

@@ -166,6 +166,18 @@ class NormalEquations:
         first = np.concatenate([common, lu_solve(factors, right[k:]) - by_common @ common])
         return np.concatenate([first, scaled - self.coupling @ first / self.diagonal])
 
+    def solve_damped(self, damping: float, offset: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The step with all prior precisions multiplied by ``1 + damping``, about the present state.
+
+        Parameters
+        ----------
+        damping
+            Not negative; with 0 it is :meth:`solve`.
+        offset
+            Present value of every unknown minus its prior mean, as in :func:`normal_equations`.
+        """
+        return self.update(self.residual, (1 + damping) * self.precision, offset / (1 + damping)).solve()
+
     def information(self) -> NDArray[np.float64]:
         """Information on the common parameters ``(n_common, n_common)``, random effects integrated out."""
         k, schur_complement = self.n_common, self.schur_complement
@@ -245,6 +257,7 @@ def normal_equations(
     sampling_derivative: NDArray[np.float64] | None = None,
     lines: NDArray[np.intp] | None = None,
     trends: NDArray[np.float64] | None = None,
+    mean_precision: float = 0.0,
 ) -> NormalEquations:
     """Assemble the system without forming the derivatives by all unknowns.
 
@@ -268,6 +281,8 @@ def normal_equations(
         of the line of sub-apertures ``(n_slopes,)`` that shares that position; none by default.
     trends
         Changes of the slope gains per trend ``(n_slopes, n_trends)``; none by default.
+    mean_precision
+        Precision at which the sum of the actuator effects of the first kind is known to be zero, where it is.
     """
     if trends is None:
         trends = np.zeros((len(model), 0))
@@ -303,6 +318,8 @@ def normal_equations(
     )
     n = len(inner)
     inner[np.diag_indices(n)] += precision[:n]
+    first = n - n_kinds * len(modes)
+    inner[first : first + len(modes), first : first + len(modes)] += mean_precision
     diagonal = power + precision[n:]
     system = NormalEquations(
         inner, coupling, diagonal, _eliminate_slope_gains(inner, coupling, diagonal), np.zeros(0),

@@ -43,10 +43,10 @@ T = TypeVar("T")
 #: linear, and more so with random effects, so it is half that of the registration-only solvers. Step norms
 #: of all solvers are in this unit.
 MAX_STEP = np.array([60.0, 60.0, 2.0, 4.0, 4.0])
-#: A step is halved, at most so many times, while its cost exceeds the lowest so far by more than this factor.
+#: A step is damped more and more strongly while its cost exceeds the lowest so far by more than this factor.
 #: In a matrix that is mostly noise, 2 % more are a thousand times the square of a standard error: with that
 #: tolerance the width and the shape of the influence functions went astray along their degeneracy.
-_MAX_HALVINGS, _COST_TOLERANCE = 6, 1.001
+_DAMPINGS, _COST_TOLERANCE = (0.0, 1.0, 4.0, 16.0, 64.0, 256.0), 1.001
 #: Oscillating steps are shortened down to this fraction of the learning rate, and so many times; then the
 #: descent gives up.
 _MIN_RATE_FRACTION, _MAX_REVERSALS = 0.125, 12
@@ -234,9 +234,9 @@ def _fit_mixed_effects(
         elif norm < np.linalg.norm(previous_step):
             rate = min(2 * rate, context.learning_rate)
         previous_step = step[1:6] / MAX_STEP
-        damping = min(1.0, 1.0 / float(np.max(np.abs(step[1:6]) / MAX_STEP)))
-        step = step * damping * rate
-        trial = _take_step(problem, state, step, _COST_TOLERANCE * lowest_cost)
+        shortening = min(1.0, 1.0 / float(np.max(np.abs(step[1:6]) / MAX_STEP)))
+        largest_cost = _COST_TOLERANCE * lowest_cost
+        trial = _take_step(problem, state, system, step, shortening * rate, largest_cost)
         if trial is None:
             break
         state, system = trial
@@ -255,19 +255,26 @@ def _fit_mixed_effects(
 
 
 def _take_step(
-    problem: MixedEffectsProblem, state: MixedEffectsState, step: NDArray[np.float64], largest_cost: float
+    problem: MixedEffectsProblem,
+    state: MixedEffectsState,
+    system: NormalEquations,
+    step: NDArray[np.float64],
+    fraction: float,
+    largest_cost: float,
 ) -> tuple[MixedEffectsState, NormalEquations] | None:
-    """The state after a step, halved while its cost is larger than ``largest_cost``; ``None`` if it stays so.
+    """The state after a fraction of a system's step, damped until its cost is at most ``largest_cost``.
 
-    The problem is bilinear in gain and variant shares, so on a pyramid far from the model without
-    modulated light a full step may overshoot.
+    ``None`` if it stays larger. The problem is bilinear in gain, shares and effects. Far from the solution,
+    and along directions that only the priors determine, a full step may overshoot: it is damped as by
+    Levenberg (1944) and Marquardt (1963), in units of the priors.
     """
-    for _ in range(_MAX_HALVINGS):
-        trial_state = problem.move(state, step)
+    for damping in _DAMPINGS:
+        if damping:
+            step = system.solve_damped(damping, problem.offset(state))
+        trial_state = problem.move(state, fraction * step)
         trial_system = problem.linearise(trial_state)
         if _cost(problem, trial_state, trial_system) <= largest_cost:
             return trial_state, trial_system
-        step = step / 2
     return None
 
 
