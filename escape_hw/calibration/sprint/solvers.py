@@ -46,7 +46,7 @@ MAX_STEP = np.array([60.0, 60.0, 2.0, 4.0, 4.0])
 #: A step is damped more and more strongly while its cost exceeds the lowest so far by more than this factor.
 #: In a matrix that is mostly noise, 2 % more are a thousand times the square of a standard error: with that
 #: tolerance the width and the shape of the influence functions went astray along their degeneracy.
-_DAMPINGS, _COST_TOLERANCE = (0.0, 1.0, 4.0, 16.0, 64.0, 256.0), 1.001
+_DAMPINGS, _COST_TOLERANCE = (0.0, 1.0, 8.0, 64.0, 512.0, 4096.0, 32768.0), 1.001
 #: Oscillating steps are shortened down to this fraction of the learning rate, and so many times; then the
 #: descent gives up.
 _MIN_RATE_FRACTION, _MAX_REVERSALS = 0.125, 12
