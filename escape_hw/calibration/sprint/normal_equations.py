@@ -282,7 +282,7 @@ def normal_equations(
     trends
         Changes of the slope gains per trend ``(n_slopes, n_trends)``; none by default.
     mean_precision
-        Precision at which the sum of the actuator effects of the first kind is known to be zero, where it is.
+        Precision of the sum of the actuator effects of the first kind, about its present value; 0: free.
     """
     if trends is None:
         trends = np.zeros((len(model), 0))
