@@ -222,3 +222,23 @@ class SummingModel(SyntheticModel, Protocol):
         functions
             Factor, a number or ``(n_act,)``, registration and width of each.
         """
+
+    def zonal_components(
+        self, registration: Registration, width: float, functions: Sequence[tuple[float, float]]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Slopes of influence functions of several widths, and derivatives of their sum, per unit command.
+
+        Parameters
+        ----------
+        registration, width
+            Registration, and the width that all functions are multiples of.
+        functions
+            Factor in the sum and relative width of each.
+
+        Returns
+        -------
+        matrices : ndarray, ``(n_functions, n_slopes, n_act)``
+            Without the factors.
+        derivatives : ndarray, ``(6, n_slopes, n_act)``
+            By the five parameters of the registration, in their units, and by the width.
+        """

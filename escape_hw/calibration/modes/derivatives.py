@@ -73,6 +73,35 @@ def zonal_sum(
     return np.asarray(sum(matrices[1:], start=matrices[0]))
 
 
+def zonal_components(
+    model: SyntheticModel, registration: Registration, width: float, functions: Sequence[tuple[float, float]]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Slopes of influence functions of several widths, and derivatives of their sum, per unit command.
+
+    Parameters
+    ----------
+    registration, width
+        Registration, and the width that all functions are multiples of.
+    functions
+        Factor in the sum and relative width of each.
+
+    Returns
+    -------
+    matrices : ndarray, ``(n_functions, n_slopes, n_act)``
+        Without the factors.
+    derivatives : ndarray, ``(6, n_slopes, n_act)``
+    """
+    if isinstance(model, SummingModel):
+        return model.zonal_components(registration, width, functions)
+    matrices, total = [], np.zeros(())
+    for factor, relative_width in functions:
+        matrix, derivatives = zonal_jacobian(model, registration, width * relative_width)
+        derivatives[5] *= relative_width
+        matrices.append(matrix)
+        total = total + factor * derivatives
+    return np.stack(matrices), np.asarray(total)
+
+
 def _central_differences(
     build_matrix: Callable[[Registration, float], NDArray[np.float64]],
     registration: Registration,

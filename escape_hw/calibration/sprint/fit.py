@@ -314,7 +314,8 @@ def _solve_with_updates(
     """Solve, then again with priors and outlier weights from the data; the last weights and solution."""
     solution = None
     if state is None:
-        solution = yield from solve(context, weighted, start, coarse_search)
+        # The scatters need no exact solution, and with usual ones there may be none nearby.
+        solution = yield from solve(context, weighted, start, coarse_search, rough=update_priors)
         start, state = solution.alpha, solution.state
     if context.use_pokes(start) or solution is None:
         solution = yield from solve(context, weighted, start, False, state)

@@ -10,14 +10,13 @@ asymmetry of their own. All terms are linear in the slopes.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from escape_hw.api.registration import Registration
 from escape_hw.api.synthetic_model import PROFILE_WIDTHS, HasActuatorPositions, HasProfile, SyntheticModel
-from escape_hw.calibration.modes.derivatives import zonal_jacobian, zonal_sum
+from escape_hw.calibration.modes.derivatives import zonal_components, zonal_jacobian, zonal_sum
 
 #: Lobes of the four-fold terms: distance in pitches, and width relative to the nominal one.
 _FOURFOLD_LOBES = ((0.4, 0.35), (0.8, 0.6), (1.6, 1.0))
@@ -30,6 +29,8 @@ _EDGE_GAIN_SIGMA, _EDGE_WIDTH_SIGMA, _EDGE_PROFILE_SIGMA, _EDGE_ASYMMETRY_SIGMA 
 #: Changes of registration, in its units, and width below which these terms, a few per cent of the matrix, are
 #: kept.
 _KEEP_WITHIN = np.array([5.0, 5.0, 0.1, 0.2, 0.2, 0.01])
+#: Half step of derivatives by position, in % of a sub-aperture.
+_SHIFT_STEP = 2.0
 #: Actuators closer than this many pitches are neighbours.
 _NEIGHBOUR_DISTANCE = 1.3
 #: Squared standard deviation of a Gaussian of coupling 0.4 in squared pitches: the scale of the asymmetry.
@@ -42,17 +43,15 @@ class ShapedMatrix:
 
     Parameters
     ----------
-    nominal, base
-        Slopes per unit command of the nominal influence functions ``(n_slopes, n_act)``, and their
-        derivatives by the registration and the width ``(6, n_slopes, n_act)``.
-    matrix, jacobian
-        The same of the shaped ones.
+    nominal, matrix
+        Slopes per unit command of the nominal and of the shaped influence functions ``(n_slopes, n_act)``.
+    jacobian
+        Derivatives of the latter by the registration and the width ``(6, n_slopes, n_act)``.
     terms
         Derivative by each coefficient ``(n_slopes, n_act)``.
     """
 
     nominal: NDArray[np.float64]
-    base: NDArray[np.float64]
     matrix: NDArray[np.float64]
     jacobian: NDArray[np.float64]
     terms: list[NDArray[np.float64]]
@@ -101,8 +100,8 @@ class InfluenceShape:
             sigma += [_FOURFOLD_SIGMA] * len(_FOURFOLD_LOBES) + [_EDGE_GAIN_SIGMA, _EDGE_WIDTH_SIGMA]
             sigma += [_EDGE_PROFILE_SIGMA] * n + [_EDGE_ASYMMETRY_SIGMA] * (n + 1)
         self.prior_sigma = np.array(sigma)
-        self._fourfold_at: NDArray[np.float64] | None = None
-        self._fourfold: list[NDArray[np.float64]] = []
+        self._directed_at: NDArray[np.float64] | None = None
+        self._directed: tuple[list[NDArray[np.float64]], list[NDArray[np.float64]]] = [], []
 
     @property
     def n_terms(self) -> int:
@@ -121,30 +120,24 @@ class InfluenceShape:
         coefficients
             Coefficient of each term ``(n_terms,)``.
         """
-        single, by_single = zonal_jacobian(self._model, registration, width)
+        n = len(self._widths)
+        # The functions of the profile replace the first one.
+        shares = self._shares + np.append(-coefficients[:n].sum(), coefficients[:n])
+        components, jacobian = zonal_components(
+            self._model, registration, width, [*zip(shares.tolist(), PROFILE_WIDTHS, strict=True)]
+        )
+        nominal = np.tensordot(self._shares, components, axes=1)
         if self._given is not None:
-            given: Any = zonal_jacobian(self._given, registration, width)
-            nominal, base = given
-        else:
-            nominal, base = self._shares[0] * single, self._shares[0] * by_single
-        jacobian, profile, outward = 0.0, [], [self._outward_derivative(by_single)]
-        for relative_width, nominal_share, share in zip(
-            self._widths, self._shares[1:], coefficients, strict=False
-        ):
-            component, derivatives = zonal_jacobian(self._model, registration, width * relative_width)
-            derivatives[5] *= relative_width
-            nominal += nominal_share * component
-            base += nominal_share * derivatives
-            jacobian = jacobian + share * (derivatives - by_single)
-            profile.append(component - single)
-            outward.append(relative_width**2 * self._outward_derivative(derivatives))
-        jacobian = base + jacobian
+            given, by_given = zonal_jacobian(self._given, registration, width)
+            nominal, jacobian = nominal + given, jacobian + by_given
+        profile = [one - components[0] for one in components[1:]]
         terms = profile
         if self._edge is not None:
-            terms = terms + self._fourfold_terms(registration, width)
+            fourfold, outward = self._directed_terms(registration, width)
+            terms = terms + fourfold
             common = _add(nominal, coefficients, terms)
             terms += [self._edge * part for part in (common, width * jacobian[5], *profile, *outward)]
-        return ShapedMatrix(nominal, base, _add(nominal, coefficients, terms), jacobian, terms)
+        return ShapedMatrix(nominal, _add(nominal, coefficients, terms), jacobian, terms)
 
     def matrix(
         self,
@@ -217,17 +210,38 @@ class InfluenceShape:
         weights += self._shares[:, None] * edge_gain
         return weights, edge_gain
 
-    def _outward_derivative(self, jacobian: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Derivative by outward positions of the actuators ``(n_slopes, n_act)``."""
-        if self._edge is None:
-            return np.zeros(jacobian.shape[1:])
-        return np.asarray(jacobian[0] * self._outward[0] + jacobian[1] * self._outward[1])
+    def _directed_terms(
+        self, registration: Registration, width: float
+    ) -> tuple[list[NDArray[np.float64]], list[NDArray[np.float64]]]:
+        """The terms that have a direction: four-fold ones, and outward asymmetries by width.
+
+        They are a few per cent of the matrix: those of a nearby registration are kept, and the derivatives of
+        the four-fold ones are neglected.
+        """
+        at = np.append(registration.to_array(), width)
+        if self._directed_at is None or (np.abs(at - self._directed_at) >= _KEEP_WITHIN).any():
+            self._directed_at = at
+            self._directed = (
+                self._fourfold_terms(registration, width),
+                [
+                    relative**2 * self._outward_derivative(registration, width * relative)
+                    for relative in PROFILE_WIDTHS
+                ],
+            )
+        return self._directed
+
+    def _outward_derivative(self, registration: Registration, width: float) -> NDArray[np.float64]:
+        """Derivative by outward positions of the actuators ``(n_slopes, n_act)``, by central differences."""
+        along_x, along_y = self._outward / (2 * _SHIFT_STEP)
+        moved = []
+        for sign in (1.0, -1.0):
+            x, y = registration.shift_x + sign * _SHIFT_STEP, registration.shift_y + sign * _SHIFT_STEP
+            moved.append((sign * along_x, replace(registration, shift_x=x), width))
+            moved.append((sign * along_y, replace(registration, shift_y=y), width))
+        return zonal_sum(self._model, moved)
 
     def _fourfold_terms(self, registration: Registration, width: float) -> list[NDArray[np.float64]]:
-        """Lobes along the axes of the mirror less those between them; their derivatives are neglected."""
-        at = np.append(registration.to_array(), width)
-        if self._fourfold_at is not None and (np.abs(at - self._fourfold_at) < _KEEP_WITHIN).all():
-            return self._fourfold
+        """Lobes along the axes of the mirror less those between them."""
         affine, _ = registration.affine(self._model.sub_aperture_m)
         terms = []
         for distance, relative_width in _FOURFOLD_LOBES:
@@ -242,7 +256,6 @@ class InfluenceShape:
                 )
                 lobes.append(((-1.0) ** number, shifted, width * relative_width))
             terms.append(zonal_sum(self._model, lobes))
-        self._fourfold_at, self._fourfold = at, terms
         return terms
 
 

@@ -193,14 +193,16 @@ class MixedEffectsProblem:
         registration, w = Registration.from_array(state.alpha), 1.0 + state.width
         shaped = self.shape.linearise(registration, w, state.shape)
         jacobian, variants = shaped.jacobian, []
+        base = None
         for variant, share in zip(self.variants, state.variant, strict=False):
             if abs(share) < _SMALL_SHARE:
                 variants.append(variant.zonal_matrix(registration, w) - shaped.nominal)
                 continue
             # A large share changes the derivatives by the registration.
             changed, changes = zonal_jacobian(variant, registration, w)
+            base = zonal_jacobian(self.model, registration, w)[1] if base is None else base
             variants.append(changed - shaped.nominal)
-            jacobian = jacobian + share * (changes - shaped.base)
+            jacobian = jacobian + share * (changes - base)
 
         def profile_matrix(model: SyntheticModel, at: Registration) -> NDArray[np.float64]:
             return self.shape.profile_matrix(model, at, w, state.shape)
@@ -278,14 +280,24 @@ class MixedEffectsProblem:
             self.kept = None
         return self.linearise(state)
 
+    def _extrapolate(self, state: MixedEffectsState, z: _ZonalMatrices) -> NDArray[np.float64]:
+        """The weighted matrix of a state, with derivatives from near it ``(n_slopes, n_modes)``."""
+        registration, w = Registration.from_array(state.alpha), 1.0 + state.width
+        total = self._add_effects(self.shape.matrix(registration, w, state.shape, z.terms), state, z)
+        scale = (state.gain * self._slope_gains(state) / self.weighted.by_slope)[:, None]
+        modes = (1 + state.actuator_gain)[:, None] * self.modes
+        return np.asarray(scale * (self._sampled(state, total, z) @ modes))
+
+    def extrapolate_residual(self, state: MixedEffectsState) -> NDArray[np.float64]:
+        """The residual about a state, with the derivatives of the last linearisation."""
+        assert self.kept is not None
+        return np.asarray(self.weighted.data - self._extrapolate(state, self.kept[0]))
+
     def _update_kept(
         self, state: MixedEffectsState, z: _ZonalMatrices, system: NormalEquations
     ) -> NormalEquations | None:
         """The system of a state with derivatives from near it; ``None`` if it is too far."""
-        registration, w = Registration.from_array(state.alpha), 1.0 + state.width
-        total = self._add_effects(self.shape.matrix(registration, w, state.shape, z.terms), state, z)
-        scale = (state.gain * self._slope_gains(state) / self.weighted.by_slope)[:, None]
-        model = scale * (self._sampled(state, total, z) @ ((1 + state.actuator_gain)[:, None] * self.modes))
+        model = self._extrapolate(state, z)
         before = self.weighted.data - system.residual
         if np.linalg.norm(model - before) > _KEEP_BELOW * np.linalg.norm(before):
             return None

@@ -47,6 +47,10 @@ MAX_STEP = np.array([60.0, 60.0, 2.0, 4.0, 4.0])
 #: In a matrix that is mostly noise, 2 % more are a thousand times the square of a standard error: with that
 #: tolerance the width and the shape of the influence functions went astray along their degeneracy.
 _DAMPINGS, _COST_TOLERANCE = (0.0, 1.0, 8.0, 64.0, 512.0, 4096.0, 32768.0), 1.001
+#: A rough fit ends when the cost falls by less than to this factor.
+_ROUGH_CHANGE = 0.999
+#: An extrapolated cost this much above the limit shows that a step is too long.
+_MAX_EXCESS = 1.01
 #: Oscillating steps are shortened down to this fraction of the learning rate, and so many times; then the
 #: descent gives up.
 _MIN_RATE_FRACTION, _MAX_REVERSALS = 0.125, 12
@@ -143,11 +147,14 @@ def solve(
     start: NDArray[np.float64],
     coarse_search: bool,
     state: MixedEffectsState | None = None,
+    rough: bool = False,
 ) -> Procedure[SprintSolution]:
     """Solve for weighted columns, from a registration ``start (5,)``, with the solver of the context.
 
     The iterations are recorded in the context. With ``coarse_search`` the start is searched from far away.
-    A ``state`` of an earlier solution is where the mixed-effects fit starts.
+    A ``state`` of an earlier solution is where the mixed-effects fit starts. A ``rough`` one ends as soon as
+    its cost hardly changes: with usual scatters of the effects, and a model that misfits by many times the
+    noise, further iterations wander along degeneracies.
     """
     model, solver, rate = context.model, context.solver, context.learning_rate
     n = context.max_iterations
@@ -171,7 +178,7 @@ def solve(
             weighted, model, context.priors, extras=context.extras, earlier=context.problem
         )
         state = state or problem.initial_state(Registration.from_array(start))
-        solution = yield from _fit_mixed_effects(problem, state, context)
+        solution = yield from _fit_mixed_effects(problem, state, context, rough)
         # The errors follow from the derivatives at the solution itself.
         return replace(solution, system=problem.relinearise(solution.state or state, solution.system))
     # The coarse search ignores slope weights.
@@ -205,12 +212,12 @@ def _record_steps(steps: Generator[LeastSquaresFit, None, T], context: SolverCon
 
 
 def _fit_mixed_effects(
-    problem: MixedEffectsProblem, state: MixedEffectsState, context: SolverContext
+    problem: MixedEffectsProblem, state: MixedEffectsState, context: SolverContext, rough: bool = False
 ) -> Procedure[SprintSolution]:
     """Gauss-Newton iteration on registration and random effects together, from a state."""
     system, steps_converged = problem.linearise(state), False
     rate, previous_step, reversals = context.learning_rate, np.zeros(5), 0
-    lowest_cost = _cost(problem, state, system)
+    lowest_cost = _cost(problem, state, system.residual)
     for _ in range(context.max_iterations):
         if context.report.step():
             yield context.progress()
@@ -240,7 +247,10 @@ def _fit_mixed_effects(
         if trial is None:
             break
         state, system = trial
-        lowest_cost = min(lowest_cost, _cost(problem, state, system))
+        cost, previous_cost = _cost(problem, state, system.residual), lowest_cost
+        lowest_cost = min(lowest_cost, cost)
+        if rough and cost > _ROUGH_CHANGE * previous_cost:
+            break
     else:
         # Not the last step, which was a fraction of the full one, but the full step from where it led.
         remaining_step = system.solve()[1:6]
@@ -272,16 +282,22 @@ def _take_step(
         if damping:
             step = system.solve_damped(damping, problem.offset(state))
         trial_state = problem.move(state, fraction * step)
+        # Most of the time of a step goes into derivatives, which a step that is too long does not need.
+        if (
+            _cost(problem, trial_state, problem.extrapolate_residual(trial_state))
+            > _MAX_EXCESS * largest_cost
+        ):
+            continue
         trial_system = problem.linearise(trial_state)
-        if _cost(problem, trial_state, trial_system) <= largest_cost:
+        if _cost(problem, trial_state, trial_system.residual) <= largest_cost:
             return trial_state, trial_system
     return None
 
 
-def _cost(problem: MixedEffectsProblem, state: MixedEffectsState, system: NormalEquations) -> float:
-    """Sum of squares of the residual and of the distances from the priors, in standard errors."""
+def _cost(problem: MixedEffectsProblem, state: MixedEffectsState, residual: NDArray[np.float64]) -> float:
+    """Sum of squares of a residual and of the distances from the priors, in standard errors."""
     offset = problem.offset(state)
-    return float(np.vdot(system.residual, system.residual) + offset @ (problem.precision * offset))
+    return float(np.vdot(residual, residual) + offset @ (problem.precision * offset))
 
 
 def _iteration_record(

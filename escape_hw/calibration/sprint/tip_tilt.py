@@ -15,7 +15,13 @@ from numpy.typing import NDArray
 from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.registration import Registration
 from escape_hw.api.synthetic_model import SyntheticModel
-from escape_hw.calibration.modes.derivatives import modal_jacobian, modal_matrix, zonal_jacobian, zonal_sum
+from escape_hw.calibration.modes.derivatives import (
+    modal_jacobian,
+    modal_matrix,
+    zonal_components,
+    zonal_jacobian,
+    zonal_sum,
+)
 
 #: Mean slope of a column relative to its rms below which its tip and tilt count as removed: rounding in
 #: single precision leaves 1e-6, a measured column about its noise over the root of the number of slopes.
@@ -59,6 +65,13 @@ class TipTiltFreeModel:
     ) -> NDArray[np.float64]:
         """Slopes of a sum of influence functions per unit command ``(n_slopes, n_act)``."""
         return remove_tip_tilt(zonal_sum(self._model, functions))
+
+    def zonal_components(
+        self, registration: Registration, width: float, functions: Sequence[tuple[float, float]]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Slopes of influence functions of several widths, and derivatives of their sum."""
+        matrices, derivatives = zonal_components(self._model, registration, width, functions)
+        return remove_tip_tilt(matrices), remove_tip_tilt(derivatives)
 
     def zonal_jacobian(
         self, registration: Registration, width: float = 1.0

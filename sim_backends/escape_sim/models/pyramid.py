@@ -69,6 +69,9 @@ _STRENGTH_UNCERTAINTY, _ELLIPSE = 0.4, 0.05
 #: patterns displace images whose sum is used or whose difference does not depend on the phase.
 _IMAGE_POSITION_ERROR_PX, _DIAGONALS = 0.1, np.array([1.0, -1.0, -1.0, 1.0])
 
+#: Kinds of the factors along x and y in the derivatives by the positions and by the logarithms of the widths.
+_DERIVATIVE_KINDS = ((1, 0), (0, 1), (2, 0), (0, 2))
+
 
 def nominal_pupils(config: SystemConfig) -> PyramidPupils:
     """The design's pupil images; valid where the design flux is sufficient."""
@@ -220,13 +223,44 @@ class PyramidModel(DesignModel):
         if measured is not None:
             return measured
         factors = self._factors(self._nodes, registration, width, derivatives=True)
-        pairs = ((0, 0), (1, 0), (0, 1), (2, 0), (0, 2))
-        parts = [self._slopes(_zonal_surfaces(factors, i, j)) for i, j in pairs]
-        # By the positions along x and y, and by the logarithms of the widths along x and y.
+        matrix = self._slopes(_zonal_surfaces(factors, 0, 0))
+        parts = [self._slopes(_zonal_surfaces(factors, *kinds)) for kinds in _DERIVATIVE_KINDS]
+        return matrix, self._combine(factors, parts)
+
+    def zonal_components(
+        self, registration: Registration, width: float, functions: Sequence[tuple[float, float]]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Functions of several widths, and derivatives of their sum, see :class:`SummingModel`."""
+        each = [
+            self._factors(self._nodes, registration, width * relative, derivatives=share != 0)
+            for share, relative in functions
+        ]
+        matrices = np.stack([self._slopes(_zonal_surfaces(factors, 0, 0)) for factors in each])
+        summed = [
+            (np.float32(share), factors)
+            for (share, _), factors in zip(functions, each, strict=True)
+            if share != 0
+        ]
+        if not summed:
+            return matrices, np.zeros((N_DERIVATIVES, *matrices.shape[1:]))
+        parts = []
+        # The slopes are linear in the surfaces, so only those of the sum are computed.
+        for kinds in _DERIVATIVE_KINDS:
+            surfaces = np.zeros((self._nodes.size, self._nodes.size, self.n_act), np.float32)
+            for factor, factors in summed:
+                surfaces += factor * _zonal_surfaces(factors, *kinds)
+            parts.append(self._slopes(surfaces))
+        # The logarithms of all widths change alike.
+        log_width = summed[0][1].log_width.copy()
+        log_width[5] = 1 / width
+        return matrices, self._combine(replace(summed[0][1], log_width=log_width), parts)
+
+    def _combine(self, factors: GaussianFactors, parts: list[NDArray[np.float64]]) -> NDArray[np.float64]:
+        """Derivatives by the parameters from those by positions and by logarithms of the widths."""
         derivatives = np.concatenate(
             [factors.position, np.repeat(factors.log_width[:, :, None], self.n_act, 2)], axis=1
         )
-        return parts[0], np.einsum("pka,ksa->psa", derivatives, np.stack(parts[1:]), optimize=True)
+        return np.asarray(np.einsum("pka,ksa->psa", derivatives, np.stack(parts), optimize=True))
 
     def with_pupil_shift(self, shift_x: float, shift_y: float) -> PyramidModel:
         """The model with shifted images under the same turbulence, see :class:`HasPupilShift`."""

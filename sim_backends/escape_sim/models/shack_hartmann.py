@@ -404,6 +404,23 @@ _N_POKES = 8
 _SAME_POKES_WITHIN = np.array([0.5, 0.5, 0.05, 0.1, 0.1])
 
 
+def _combine(
+    position: NDArray[np.floating], log_width: NDArray[np.floating], parts: NDArray[np.floating]
+) -> NDArray[np.float64]:
+    """Derivatives by the parameters ``(6, n_slopes, n_act)`` from ``parts (4, n_slopes, n_act)``.
+
+    The parts are the derivatives by the positions along x and y and by the logarithms of the widths.
+    """
+    out = np.empty((N_DERIVATIVES, *parts.shape[1:]))
+    for p, ((along_x, along_y), (width_x, width_y)) in enumerate(zip(position, log_width, strict=True)):
+        out[p] = parts[0] * along_x + parts[1] * along_y
+        if width_x:
+            out[p] += parts[2] * width_x
+        if width_y:
+            out[p] += parts[3] * width_y
+    return out
+
+
 def nominal_grid(config: SystemConfig) -> SubApertureGrid:
     """The design's grid, centred on the camera region; valid where the design flux is sufficient."""
     flux, n = nominal_flux(config), config.sensor.n_sub
@@ -498,16 +515,30 @@ class ShackHartmannModel(DesignModel):
         factors = self._factors(self._slopes.nodes_m, registration, width, derivatives=True)
         parts = factors.sum_terms(self._slopes.zonal(factors, derivatives=True))
         parts *= np.float32(self._opd_per_command_m)
-        out = np.empty((N_DERIVATIVES, *parts.shape[1:]))
-        for p, ((along_x, along_y), (width_x, width_y)) in enumerate(
-            zip(factors.position, factors.log_width, strict=True)
-        ):
-            out[p] = parts[1] * along_x + parts[2] * along_y
-            if width_x:
-                out[p] += parts[3] * width_x
-            if width_y:
-                out[p] += parts[4] * width_y
-        return parts[0].astype(float), out
+        return parts[0].astype(float), _combine(factors.position, factors.log_width, parts[1:])
+
+    def zonal_components(
+        self, registration: Registration, width: float, functions: Sequence[tuple[float, float]]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Functions of several widths, and derivatives of their sum, see :class:`SummingModel`."""
+        matrices, summed = [], []
+        for share, relative in functions:
+            derivatives = share != 0
+            factors = self._factors(
+                self._slopes.nodes_m, registration, width * relative, derivatives=derivatives
+            )
+            parts = factors.sum_terms(self._slopes.zonal(factors, derivatives=derivatives))
+            parts *= np.float32(self._opd_per_command_m)
+            matrices.append(parts[0].astype(float))
+            if derivatives:
+                # The logarithms of all widths change alike.
+                log_width = factors.log_width.copy()
+                log_width[5] = 1 / width
+                summed.append((factors.position, log_width, np.float32(share) * parts[1:]))
+        if not summed:
+            return np.stack(matrices), np.zeros((N_DERIVATIVES, *matrices[0].shape))
+        total = np.sum([parts for _, _, parts in summed], axis=0)
+        return np.stack(matrices), _combine(*summed[0][:2], total)
 
     def modal_matrix(
         self, registration: Registration, m2c: NDArray[np.float64], width: float = 1.0
