@@ -100,7 +100,7 @@ def page(tables: dict[str, list[Line]]) -> str:
         "([what they show](../validation.md)). Columns: shift x and y in % of a sub-aperture, rotation in "
         "degrees, radial and tangential scaling in % of the diameter. Rows: rms error, mean error, and mean "
         "squared error over the squared standard error; *matrix*: mean of what the pseudo-synthetic matrix "
-        "leaves of the noise-free one of the calm bench, in % of it; *images*: rms error of the mean place of "
+        "leaves of the noise-free one of the calm bench, in % of it; *images*: rms error of the place of "
         "the pupil images in pixels.", "",
         "![Errors in standard errors](errors.png)", "",
         "*Errors of all realisations in their standard errors, by parameter.*",
