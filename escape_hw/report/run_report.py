@@ -17,6 +17,7 @@ from escape_hw.report.figures import bench as figures_bench
 from escape_hw.report.figures import gains as figures_gains
 from escape_hw.report.figures import matrix as figures_matrix
 from escape_hw.report.figures import registration as figures_registration
+from escape_hw.report.figures import residual as figures_residual
 from escape_hw.report.figures import style
 from escape_hw.report.figures import track as figures_track
 from escape_hw.report.sweep import sweep_section
@@ -145,6 +146,7 @@ def _registration_section(run: RunContent) -> str:
                     + (" Dotted: injected value." if run.injected is not None else ""),
                 )
             )
+        parts.append(_residual_map(run, number, label))
         if estimate.influence_profile is not None:
             parts.append(
                 html.figure(
@@ -157,6 +159,22 @@ def _registration_section(run: RunContent) -> str:
         parts.append(html.note_list(list(estimate.warnings), "bad"))
         parts.append(html.note_list(list(estimate.notes)))
     return html.section("Registration", *parts)
+
+
+def _residual_map(run: RunContent, number: int, label: str) -> str:
+    """The residual of the fit over the pupil and the mirror, if it was judged."""
+    result = next(one for name, one in run.calibrations.items() if run.columns[name] == label)
+    estimate = result.registration
+    if estimate is None or estimate.goodness_of_fit is None:
+        return ""
+    found, valid = estimate.goodness_of_fit, (result.measured or result.matrix).valid
+    drawing = figures_residual.residual_map(found, valid, run.layout, run.places_m)
+    caption = (
+        f"Residual of the fit{f' ({label})' if label else ''}: rms over all modes and both slopes of every "
+        "sub-aperture (left), and over all slopes of every actuator (right), in standard errors. Noise alone "
+        "is 1. Circles: more than three times the median."
+    )
+    return html.figure(f"residual-map{number}", drawing, caption)
 
 
 def _gains_section(run: RunContent) -> str:
