@@ -26,6 +26,7 @@ from escape_hw.report.content import RunContent, read_run
 from escape_hw.report.figures import bench as figures_bench
 from escape_hw.report.figures import matrix as figures_matrix
 from escape_hw.report.figures import registration as figures_registration
+from escape_hw.report.figures import residual as figures_residual
 from escape_hw.report.figures import style
 from escape_hw.report.run_report import draw_picture, write_picture, write_report
 
@@ -96,6 +97,34 @@ class Checker(HTMLParser):
                 self.ids.append(value)
             if name in ("src", "href", "xlink:href") and not value.startswith(("#", "data:")):
                 self.outside.append(value)
+
+
+def test_page_says_that_the_model_does_not_fit(tmp_path):
+    result = fake.calibration(n=8, n_modes=6, fits=False)
+    with RunFolder("razor-shwfs", "test", tmp_path / "run") as run:
+        run.add_product("escape", save_matrix(run.file("escape.fits"), result))
+        run.write_result({
+            **documents.header_fields("test", "razor-shwfs", True, 1),
+            **documents.calibration_document(result), "warnings": [],
+        })  # fmt: skip
+    text = write_report(run.path).read_text(encoding="utf-8")
+    assert '<p class="verdict usable" role="status">Usable: converged, but the model does not fit' in text
+    assert "<li>the model does not fit: 14% of the matrix remain</li>" in text
+    assert "Residual of the fit (ESCAPE)" in text or "Residual of the fit: rms" in text
+
+
+@pytest.mark.parametrize("layout", [fake.layout(), None, np.ones((2, 2), dtype=bool)])
+def test_residual_map_marks_the_outliers(layout):
+    lenslets = fake.grid(8)
+    found = fake.goodness_of_fit(lenslets.n_valid, fits=False)
+    figure = figures_residual.residual_map(found, lenslets.valid, layout)
+    pupil, mirror = figure.axes[:2]
+    assert np.flatnonzero(pupil.collections[0].get_linewidths()).tolist() == [0, 1, 2]
+    assert pupil.get_title().startswith("sub-apertures: median 1, largest")
+    if layout is not None and layout.sum() == 97:
+        assert np.flatnonzero(mirror.collections[0].get_linewidths()).tolist() == [23]
+    else:
+        assert mirror.get_xlabel() == "actuator"
 
 
 def test_page_is_sound_and_self_contained(page):

@@ -59,7 +59,7 @@ class Misfit:
     excess
         In variances of the noise; without standard errors all of the residual.
     excess_sigma
-        Its standard error for noise alone.
+        Its standard error.
     fraction
         Rms of the residual beyond the noise, relative to that of the matrix; 0 where it is not significant.
     """
@@ -130,8 +130,8 @@ def describe_misfit(weighted: WeightedMatrix, residual: NDArray[np.float64]) -> 
     chi2 = weighted.reduced_chi_squared(residual)
     return (
         f"the model does not fit: {misfit.fraction:.0%} of the matrix remain beyond its noise (reduced "
-        f"chi-squared {chi2:.3g}, where 1 ± {misfit.excess_sigma:.2g} are expected); the standard errors of "
-        f"the registration contain a factor of {np.sqrt(chi2):.1f} for it",
+        f"chi-squared {chi2:.3g}, {misfit.excess / misfit.excess_sigma:.0f} standard errors above 1); the "
+        f"standard errors of the registration contain a factor of {np.sqrt(chi2):.1f} for it",
     )
 
 

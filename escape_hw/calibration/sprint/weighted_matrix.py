@@ -99,7 +99,7 @@ class WeightedMatrix:
 
     def reduced_chi_squared(self, residual: NDArray[np.float64]) -> float:
         """Sum of squares of a residual ``(n_slopes, n_modes)`` relative to that of the noise."""
-        return float(np.square(residual).sum()) / self.expected_noise
+        return float(np.square(residual).sum() / self.expected_noise)
 
     @property
     def signal_fraction(self) -> float:

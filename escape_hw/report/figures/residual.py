@@ -17,6 +17,7 @@ _MAP = "viridis"
 _PERCENTILE = 98.0
 #: Least end of the colour scale in standard errors: the residuals of noise are of one colour.
 _MIN_LIMIT = 2.0
+_LABEL = "rms residual [standard errors]"
 
 
 def residual_map(
@@ -39,36 +40,46 @@ def residual_map(
     """
     figure = style.new_figure(8.4, 3.9)
     pupil, mirror = figure.subplots(1, 2)
-    rows, columns = np.nonzero(valid)
-    _draw_map(figure, pupil, found.by_sub_aperture, np.stack([columns, rows], axis=1), "sub-apertures")
-    rms = found.by_actuator
+    shown = np.concatenate([found.by_sub_aperture, found.by_actuator])
+    limit = max(float(np.percentile(shown, _PERCENTILE)), _MIN_LIMIT)
+    _draw_map(pupil, found.by_sub_aperture, _grid_places(valid), limit, "sub-apertures")
+    rms, axes = found.by_actuator, [pupil]
     if layout is not None and int(layout.sum()) == rms.size:
-        rows, columns = np.nonzero(layout)
-        _draw_map(figure, mirror, rms, np.stack([columns, rows], axis=1), "actuators")
-    elif places_m is not None and len(places_m) == rms.size:
-        _draw_map(figure, mirror, rms, places_m, "actuators")
+        places_m = _grid_places(layout)
+    if places_m is not None and len(places_m) == rms.size:
+        _draw_map(mirror, rms, places_m, limit, "actuators")
+        axes.append(mirror)
     else:
         style.style_axes(mirror).plot(rms, ".", color=style.SERIES[0], ms=4)
         mirror.axhline(1.0, color=style.MUTED, lw=1.0, ls=":")
-        mirror.set(xlabel="actuator", ylabel="rms residual [standard errors]", ylim=(0, None))
-        mirror.set_title("actuators", fontsize=9.5)
+        mirror.set(xlabel="actuator", ylabel=_LABEL, ylim=(0, None))
+        mirror.set_title(_title("actuators", rms), color=style.INK, fontsize=9.5)
+    style.colour_bar(figure, axes, _MAP, (0.0, limit), _LABEL)
     return figure
 
 
+def _grid_places(used: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Columns and rows of the used places of a grid ``(n, 2)``."""
+    return np.argwhere(used)[:, ::-1].astype(float)
+
+
+def _title(kind: str, rms: NDArray[np.float64]) -> str:
+    return f"{kind}: median {np.median(rms):.2g}, largest {rms.max():.2g}"
+
+
 def _draw_map(
-    figure: Figure, axes: Axes, rms: NDArray[np.float64], places: NDArray[np.float64], title: str
+    axes: Axes, rms: NDArray[np.float64], places: NDArray[np.float64], limit: float, kind: str
 ) -> None:
-    """Draw values at their places ``(n, 2)`` as (x, y), rows downwards, with a colour bar of their own."""
-    limit = max(float(np.percentile(rms, _PERCENTILE)), _MIN_LIMIT)
+    """Draw values at their places ``(n, 2)`` as (x, y), rows downwards; outliers with a border."""
     distance = np.hypot(*(places[:, None, k] - places[:, k] for k in (0, 1)))
     np.fill_diagonal(distance, np.inf)
     radius = 0.5 * float(np.median(distance.min(axis=1))) if len(places) > 1 else 0.5
-    spots = PatchCollection([Circle((x, y), radius) for x, y in places], linewidths=0)
+    width = np.zeros(rms.size)
+    width[find_outliers(rms)] = 1.6
+    spots = PatchCollection([Circle((x, y), radius) for x, y in places], linewidths=width)
     spots.set_facecolor([tuple(c) for c in style.map_colours(rms, _MAP, 0.0, limit)])
+    spots.set_edgecolor(style.SERIES[5])
     style.hide_axes(axes).add_collection(spots)
-    marked = [Circle(places[k], radius) for k in find_outliers(rms)]
-    axes.add_collection(PatchCollection(marked, facecolor="none", edgecolor=style.SERIES[5], linewidth=1.2))
-    low, high = places.min(axis=0) - radius, places.max(axis=0) + radius
+    low, high = places.min(axis=0) - 1.2 * radius, places.max(axis=0) + 1.2 * radius
     axes.set(xlim=(low[0], high[0]), ylim=(high[1], low[1]), aspect="equal")
-    axes.set_title(f"{title}, median {np.median(rms):.2g}", color=style.INK, fontsize=9.5)
-    style.colour_bar(figure, [axes], _MAP, (0.0, limit), "rms residual [standard errors]")
+    axes.set_title(_title(kind, rms), color=style.INK, fontsize=9.5)
