@@ -90,12 +90,12 @@ class WeightedMatrix:
     @property
     def noise_variances(self) -> NDArray[np.float64]:
         """Variance of the noise of every slope ``(n_slopes,)`` in units of the data."""
-        return np.broadcast_to(np.asarray(self.slope_weights, float), len(self.data))
+        return np.asarray(np.broadcast_to(self.slope_weights, len(self.data)), float)
 
     @property
     def expected_noise(self) -> float:
         """Expected sum of squares of the noise."""
-        return float(self.noise_variances.sum()) * self.data.shape[1]
+        return float(self.noise_variances.sum() * self.data.shape[1])
 
     def reduced_chi_squared(self, residual: NDArray[np.float64]) -> float:
         """Sum of squares of a residual ``(n_slopes, n_modes)`` relative to that of the noise."""
