@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from escape_hw.api.results import RegistrationEstimate
 from escape_hw.errors import ProductError
 from escape_hw.io.storage import write_atomic
 from escape_hw.report import html, tables
@@ -146,7 +147,7 @@ def _registration_section(run: RunContent) -> str:
                     + (" Dotted: injected value." if run.injected is not None else ""),
                 )
             )
-        parts.append(_residual_map(run, number, label))
+        parts.append(_residual_map(run, number, label, estimate))
         if estimate.influence_profile is not None:
             parts.append(
                 html.figure(
@@ -161,14 +162,13 @@ def _registration_section(run: RunContent) -> str:
     return html.section("Registration", *parts)
 
 
-def _residual_map(run: RunContent, number: int, label: str) -> str:
+def _residual_map(run: RunContent, number: int, label: str, estimate: RegistrationEstimate) -> str:
     """The residual of the fit over the pupil and the mirror, if it was judged."""
-    result = next(one for name, one in run.calibrations.items() if run.columns[name] == label)
-    estimate = result.registration
-    if estimate is None or estimate.goodness_of_fit is None:
+    if estimate.goodness_of_fit is None:
         return ""
-    found, valid = estimate.goodness_of_fit, (result.measured or result.matrix).valid
-    drawing = figures_residual.residual_map(found, valid, run.layout, run.places_m)
+    result = next(one for one in run.calibrations.values() if one.registration is estimate)
+    valid = (result.measured or result.matrix).valid
+    drawing = figures_residual.residual_map(estimate.goodness_of_fit, valid, run.layout, run.places_m)
     caption = (
         f"Residual of the fit{f' ({label})' if label else ''}: rms over all modes and both slopes of every "
         "sub-aperture (left), and over all slopes of every actuator (right), in standard errors. Noise alone "
