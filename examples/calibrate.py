@@ -36,7 +36,7 @@ for name, result in (("DO-CRIME", docrime), ("ESCAPE", escape)):
     gain, agreement = np.median(difference.gain_ratio), np.median(difference.correlation)
     print(f"{name:>8} against push-pull: median gain {gain:.3f}, median correlation {agreement:.4f}")
 
-print(f"SPRINT {'converged' if escape.registration.converged else 'did NOT converge'}:")
+print(f"SPRINT {escape.registration.outcome}:")
 for name, estimate in escape.registration.parameters().items():
     value = getattr(injected, name)
     print(f"{name:>18}: {estimate.value:8.3f} ± {estimate.sigma:.3f} {estimate.unit} (injected {value:g})")

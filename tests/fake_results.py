@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from escape_hw.api.influence import InfluenceProfile
@@ -12,6 +14,7 @@ from escape_hw.api.results import (
     ActuatorCorrections,
     CalibrationResult,
     Estimate,
+    GoodnessOfFit,
     LoopResult,
     RegistrationEstimate,
     SprintIteration,
@@ -121,13 +124,26 @@ def influence_profile() -> InfluenceProfile:
     return InfluenceProfile(radius, np.exp(-0.92 * radius**2), fitted, sigma, 1.1 * fitted, 2 * sigma)
 
 
+def goodness_of_fit(n_valid: int, fits: bool = True) -> GoodnessOfFit:
+    """Residuals of noise, or of a model that does not fit at a few sub-apertures and an actuator."""
+    rng = np.random.default_rng(6)
+    by_sub_aperture, by_actuator = (1 + 0.05 * rng.standard_normal(size) for size in (n_valid, 97))
+    if not fits:
+        by_sub_aperture[:3] *= 9.0
+        by_actuator[23] *= 5.0
+    return GoodnessOfFit(fits, 0.006 if fits else 0.144, by_sub_aperture, by_actuator)
+
+
 def calibration(
-    method: str = "escape", *, partial: bool = False, n: int = 24, n_modes: int = 94
+    method: str = "escape", *, partial: bool = False, n: int = 24, n_modes: int = 94, fits: bool = True
 ) -> CalibrationResult:
     """What a calibration procedure returns."""
     escape = method == "escape"
     noise = {"push-pull": 0.01, "escape": 0.0}.get(method, 0.12)
     lenslets = grid(n)
+    found = replace(registration(), goodness_of_fit=goodness_of_fit(lenslets.n_valid, fits))
+    if not fits:
+        found = replace(found, notes=("the model does not fit: 14% of the matrix remain",), chi2=22.4)
     return CalibrationResult(
         matrix=matrix(method, noise, n, n_modes),
         grid=lenslets,
@@ -135,7 +151,7 @@ def calibration(
         lost_frames=7,
         sky_seconds=20.0,
         response=TemporalResponse(np.array([0.0, 0.1, 0.7, 0.2]), np.full(4, 0.01)),
-        registration=registration() if escape else None,
+        registration=found if escape else None,
         measured=matrix("docrime-whitened", 0.12, n, n_modes) if escape else None,
         partial=partial,
         mean_frame=wfs_frame(lenslets).astype(np.float32),

@@ -133,7 +133,7 @@ class SprintPanel(Panel):
         converged = self._document.get("converged")
         self._history = history = ConvergenceHistory.of(
             self._data["registration"], self._data.get("registration_sigma"), self._data.get("step_norm"),
-            None if converged is None else bool(converged),
+            None if converged is None else bool(converged), self._document.get("model_fits"),
         )  # fmt: skip
         self.plot.show_convergence(history)
         verdict = assess(self._document)

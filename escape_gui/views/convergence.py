@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from escape_hw.api.registration import PARAMETERS, TO_STREAM_UNITS
+from escape_hw.api.results import describe_outcome
 
 #: Titles of the parameters, in the order of ``PARAMETERS``.
 NAMES = ("Shift x", "Shift y", "Rotation", "Radial scaling", "Tangential scaling")
@@ -34,6 +35,8 @@ class ConvergenceHistory:
     step_norm: NDArray[np.float64]
     #: ``None`` during the fit.
     converged: bool | None = None
+    #: Whether the model fits; ``None`` if that was not judged.
+    model_fits: bool | None = None
 
     @classmethod
     def of(
@@ -42,6 +45,7 @@ class ConvergenceHistory:
         sigma: NDArray[np.floating] | None,
         step_norm: NDArray[np.floating] | None,
         converged: bool | None = None,
+        model_fits: bool | None = None,
     ) -> ConvergenceHistory:
         """Build from the streams ``registration``, ``registration_sigma`` and ``step_norm``."""
         values = np.asarray(registration, float).reshape(-1, len(PARAMETERS)) / TO_STREAM_UNITS
@@ -53,7 +57,7 @@ class ConvergenceHistory:
             # The streams are read one after another and may differ by an iteration.
             known = np.asarray(step_norm, float).ravel()[: len(values)]
             norm[: known.size] = np.where(known > 0, known, np.nan)
-        return cls(values, errors, norm, converged)
+        return cls(values, errors, norm, converged, model_fits)
 
     @property
     def iterations(self) -> NDArray[np.int_]:
@@ -63,11 +67,11 @@ class ConvergenceHistory:
         """Divide each parameter by its largest magnitude (paper: SPRINT figure)."""
         largest = np.max(np.abs(self.values), axis=0, initial=0.0)
         scale = np.where(largest > 0, largest, 1.0)
-        return ConvergenceHistory(self.values / scale, self.sigma / scale, self.step_norm, self.converged)
+        return replace(self, values=self.values / scale, sigma=self.sigma / scale)
 
     def headline(self) -> str:
         n = len(self.values)
-        state = {None: "running", True: "converged", False: "NOT converged"}[self.converged]
+        state = "running" if self.converged is None else describe_outcome(self.converged, self.model_fits)
         return f"{state}, {n} iteration{'' if n == 1 else 's'}"
 
 

@@ -96,6 +96,51 @@ class SprintIteration:
     chi2: float
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class GoodnessOfFit:
+    """Residual of a fitted matrix relative to its noise.
+
+    Parameters
+    ----------
+    fits
+        Whether the residual is what noise and priors allow, apart from a small misfit.
+    misfit
+        Rms of the residual beyond the noise, relative to that of the matrix.
+    by_sub_aperture, by_actuator
+        Rms residual of every sub-aperture ``(n_valid,)`` and every actuator ``(n_act,)`` in standard errors:
+        1 for noise alone.
+    """
+
+    fits: bool
+    misfit: float
+    by_sub_aperture: NDArray[np.float64]
+    by_actuator: NDArray[np.float64]
+    __repr__ = short_repr
+
+
+#: Ratio to the median beyond which a residual is outlying.
+_OUTLIER = 3.0
+
+
+def find_outliers(rms: NDArray[np.float64]) -> list[int]:
+    """Sub-apertures or actuators with an outlying rms residual, the worst first."""
+    limit = _OUTLIER * max(float(np.median(rms)), 1e-300)
+    return [k for k in np.argsort(-rms).tolist() if rms[k] > limit]
+
+
+def describe_outcome(converged: bool, model_fits: bool | None) -> str:
+    """The outcome of SPRINT in words, the same wherever it is shown.
+
+    Parameters
+    ----------
+    converged, model_fits
+        As in :class:`RegistrationEstimate`.
+    """
+    if not converged:
+        return "NOT converged"
+    return "converged, but the model does not fit" if model_fits is False else "converged"
+
+
 @renamed_members(measured="parameters", departures="actuator_corrections")
 @dataclass(frozen=True, slots=True, eq=False)
 class RegistrationEstimate:
@@ -120,6 +165,8 @@ class RegistrationEstimate:
     repeatability_covariance
         Covariance of the registration between runs of one set-up ``(5, 5)``: the part of ``covariance`` that
         does not drop out of their differences. ``None`` if it was not estimated.
+    goodness_of_fit
+        Residual relative to the noise; ``None`` if the noise was not known independently of the fit.
     """
 
     registration: Registration
@@ -135,6 +182,17 @@ class RegistrationEstimate:
     extras: Mapping[str, Estimate] = field(default_factory=dict)
     influence_profile: InfluenceProfile | None = None
     repeatability_covariance: NDArray[np.float64] | None = None
+    goodness_of_fit: GoodnessOfFit | None = None
+
+    @property
+    def model_fits(self) -> bool | None:
+        """Whether the model fits to within noise and priors; ``None`` if that was not judged."""
+        return None if self.goodness_of_fit is None else self.goodness_of_fit.fits
+
+    @property
+    def outcome(self) -> str:
+        """Converged, converged without a fitting model, or not converged, in words."""
+        return describe_outcome(self.converged, self.model_fits)
 
     @property
     def sigma(self) -> NDArray[np.float64]:
@@ -157,8 +215,7 @@ class RegistrationEstimate:
 
     def __repr__(self) -> str:
         texts = ", ".join(f"{name} {text}" for name, text in self._formatted_values().items())
-        state = "converged" if self.converged else "NOT CONVERGED"
-        return f"<{type(self).__name__} {texts}; {state} in {len(self.iterations)} iterations>"
+        return f"<{type(self).__name__} {texts}; {self.outcome} in {len(self.iterations)} iterations>"
 
     def _formatted_values(self) -> dict[str, str]:
         """Parameters and gain with errors and units, as texts."""
@@ -172,7 +229,7 @@ class RegistrationEstimate:
         """Table of the parameters and plot of the step norms, for notebooks."""
         rows = {
             **self._formatted_values(),
-            "converged": f"{'yes' if self.converged else 'NO'}, {len(self.iterations)} iterations",
+            "outcome": f"{self.outcome}, {len(self.iterations)} iterations",
             **{f"warning {number}": text for number, text in enumerate(self.warnings, 1)},
         }
         return table_html(

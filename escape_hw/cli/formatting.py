@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,13 +12,15 @@ from rich.table import Table as RichTable
 from rich.text import Text
 
 from escape_hw.api.influence import InfluenceProfile
-from escape_hw.api.results import CalibrationResult
-from escape_hw.report.tables import Table
+from escape_hw.api.results import CalibrationResult, RegistrationEstimate
+from escape_hw.report.tables import Table, criterion_symbol
 from escape_hw.report.verdict import Quality, assess
 
 _QUALITY_STYLES = {
     Quality.GOOD: "bold green", Quality.USABLE: "bold yellow", Quality.NOT_USABLE: "bold red",
 }  # fmt: skip
+
+_CRITERION_STYLES = {"✓": "green", "!": "bold yellow", "✗": "bold red"}
 
 
 def status_line(simulated: bool, partial: bool) -> Text:
@@ -62,11 +64,18 @@ def format_calibration(result: CalibrationResult) -> list[str]:
 
 
 def format_criteria(checks: Iterable[Mapping[str, Any]]) -> list[Text]:
-    """Criteria with a tick or a cross."""
+    """Criteria with a tick, a cross, or an exclamation mark where met with a limitation."""
     return [
-        Text(f"{'✓' if entry['met'] else '✗'} {entry['text']}", style="green" if entry["met"] else "bold red")
+        Text(f"{symbol} {entry['text']}", style=_CRITERION_STYLES[symbol])
         for entry in checks
+        for symbol in [criterion_symbol(entry)]
     ]
+
+
+def registration_remarks(estimate: RegistrationEstimate, shown: Sequence[str] = ()) -> list[str]:
+    """Warnings of a registration and, where the model does not fit, its notes, without those ``shown``."""
+    notes = estimate.notes if estimate.model_fits is False else ()
+    return [remark for remark in (*estimate.warnings, *notes) if remark not in shown]
 
 
 def format_verdict(document: Mapping[str, Any]) -> list[Text]:

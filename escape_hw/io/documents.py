@@ -67,7 +67,9 @@ def snr_document(matrix: InteractionMatrix) -> dict[str, Any]:
 def registration_document(estimate: RegistrationEstimate | None) -> dict[str, Any]:
     """What SPRINT found; all ``None`` when it did not run."""
     if estimate is None:
-        return {"registration": None, "gain": None, "gain_sigma": None, "iterations": None, "converged": None}
+        return dict.fromkeys(
+            ("registration", "gain", "gain_sigma", "iterations", "converged", "model_fits", "outcome")
+        )
     between_runs = estimate.repeatability_sigma
     return {
         "registration": {name: value.to_dict() for name, value in estimate.parameters().items()},
@@ -80,6 +82,9 @@ def registration_document(estimate: RegistrationEstimate | None) -> dict[str, An
         "extras": {name: value.to_dict() for name, value in estimate.extras.items()},
         "iterations": len(estimate.iterations),
         "converged": estimate.converged,
+        "model_fits": estimate.model_fits,
+        "misfit": None if estimate.goodness_of_fit is None else estimate.goodness_of_fit.misfit,
+        "outcome": estimate.outcome,
         "chi2": estimate.chi2,
         "warnings": list(estimate.warnings),
         "registration_notes": list(estimate.notes),

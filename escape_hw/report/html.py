@@ -11,7 +11,9 @@ from urllib.parse import quote
 from matplotlib.figure import Figure
 
 from escape_hw.report.figures import style
-from escape_hw.report.tables import Table
+from escape_hw.report.tables import Table, criterion_symbol
+
+_CRITERION_CLASSES = {"✓": "good", "!": "limited", "✗": "bad"}
 
 
 def page(title: str, banners: Sequence[tuple[str, str]], body: Sequence[str]) -> str:
@@ -60,11 +62,11 @@ def figure(key: str, content: Figure, caption: str) -> str:
 
 
 def criteria_list(criteria: Sequence[Mapping[str, Any]]) -> str:
-    """Criteria with a tick or a cross; nothing without any."""
+    """Criteria with a tick, a cross, or an exclamation mark where met with a limitation."""
     items = "".join(
-        f'<li class="{"good" if check["met"] else "bad"}">{"✓" if check["met"] else "✗"} '
-        f"{escape(check['text'])}</li>"
+        f'<li class="{_CRITERION_CLASSES[symbol]}">{symbol} {escape(check["text"])}</li>'
         for check in criteria
+        for symbol in [criterion_symbol(check)]
     )
     return f'<ul class="checks">{items}</ul>' if items else ""
 

@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from escape_hw.api.results import RegistrationEstimate
 from escape_hw.errors import ProductError
 from escape_hw.io.storage import write_atomic
 from escape_hw.report import html, tables
@@ -17,6 +18,7 @@ from escape_hw.report.figures import bench as figures_bench
 from escape_hw.report.figures import gains as figures_gains
 from escape_hw.report.figures import matrix as figures_matrix
 from escape_hw.report.figures import registration as figures_registration
+from escape_hw.report.figures import residual as figures_residual
 from escape_hw.report.figures import style
 from escape_hw.report.figures import track as figures_track
 from escape_hw.report.sweep import sweep_section
@@ -145,6 +147,7 @@ def _registration_section(run: RunContent) -> str:
                     + (" Dotted: injected value." if run.injected is not None else ""),
                 )
             )
+        parts.append(_residual_map(run, number, label, estimate))
         if estimate.influence_profile is not None:
             parts.append(
                 html.figure(
@@ -157,6 +160,21 @@ def _registration_section(run: RunContent) -> str:
         parts.append(html.note_list(list(estimate.warnings), "bad"))
         parts.append(html.note_list(list(estimate.notes)))
     return html.section("Registration", *parts)
+
+
+def _residual_map(run: RunContent, number: int, label: str, estimate: RegistrationEstimate) -> str:
+    """The residual of the fit over the pupil and the mirror, if it was judged."""
+    if estimate.goodness_of_fit is None:
+        return ""
+    result = next(one for one in run.calibrations.values() if one.registration is estimate)
+    valid = (result.measured or result.matrix).valid
+    drawing = figures_residual.residual_map(estimate.goodness_of_fit, valid, run.layout, run.places_m)
+    caption = (
+        f"Residual of the fit{f' ({label})' if label else ''}: rms over all modes and both slopes of every "
+        "sub-aperture (left), and over all slopes of every actuator (right), in standard errors. Noise alone "
+        "is 1. Red border: more than three times the median."
+    )
+    return html.figure(f"residual-map{number}", drawing, caption)
 
 
 def _gains_section(run: RunContent) -> str:

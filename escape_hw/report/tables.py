@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -49,6 +50,13 @@ class Table:
     headings: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
     numeric: bool = True
+
+
+def criterion_symbol(criterion: Mapping[str, Any]) -> str:
+    """A tick for a criterion that is met, an exclamation mark if with a limitation, else a cross."""
+    if not criterion["met"]:
+        return "✗"
+    return "!" if criterion.get("limited") else "✓"
 
 
 def format_with_error(value: Estimate) -> str:

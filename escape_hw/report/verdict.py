@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any, TypeGuard
 
+from escape_hw.api.results import describe_outcome
+
 #: Signal-to-noise ratio of the worst mode from which a measured matrix is good, and usable.
 GOOD_SNR, USABLE_SNR = 3.0, 1.0
 
@@ -71,6 +73,12 @@ def _problems(document: Mapping[str, Any]) -> Iterator[Verdict]:
         )
     if document.get("converged") is False:
         yield Verdict(Quality.NOT_USABLE, "not converged", "read the warnings, and measure more frames")
+    elif document.get("model_fits") is False:
+        yield Verdict(
+            Quality.USABLE,
+            describe_outcome(True, False) + _describe_residual(document),
+            "the notes name what does not fit, and the standard errors contain it",
+        )
     for criterion in _mappings(document.get("criteria")):
         text = str(criterion.get("text"))
         # Alarms are judged below.
@@ -86,6 +94,14 @@ def _problems(document: Mapping[str, Any]) -> Iterator[Verdict]:
     if alarms:
         many = f"{len(alarms)} alarms, the last" if len(alarms) > 1 else "an alarm"
         yield Verdict(Quality.USABLE, f"{many}: {alarms[-1].get('text', '')}", "see the report")
+
+
+def _describe_residual(document: Mapping[str, Any]) -> str:
+    """What a model that does not fit leaves, in brackets."""
+    misfit, chi2 = document.get("misfit"), document.get("chi2")
+    if not _is_number(misfit) or not _is_number(chi2):
+        return ""
+    return f" ({misfit:.0%} of the matrix beyond its noise, reduced chi-squared {chi2:.3g})"
 
 
 def _noisy_modes(document: Mapping[str, Any]) -> Iterator[Verdict]:

@@ -567,7 +567,7 @@ def test_without_control_nothing_starts(session, source, control, form):
     assert isinstance(control, ScriptedControl)
 
 
-def test_a_converged_fit_with_a_noisy_mode_is_not_green(calibrate, source):
+def test_a_converged_fit_with_a_noisy_mode_or_a_misfit_is_not_green(calibrate, source):
     estimate = fake.registration()
     path = np.array([step.registration.to_array() for step in estimate.iterations])
     source.push("registration", path * TO_STREAM_UNITS)
@@ -589,3 +589,13 @@ def test_a_converged_fit_with_a_noisy_mode_is_not_green(calibrate, source):
     told = calibrate.notifications.notifications[-1]
     assert told.level is Level.WARNING
     assert line in told.text
+    document = {**calibration_document(fake.calibration("escape", fits=False)), "warnings": []}
+    source.change(last_run=FinishedRun(id=5, name="escape", finish=Finish.DONE, document=document))
+    look(calibrate)
+    words = "converged, but the model does not fit"
+    assert (sprint._indicator.level, sprint._indicator.text) == (Level.WARNING, f"{words}, 18 iterations")
+    assert f"Usable: {words} (14% of the matrix" in sprint._notes.text()
+    assert "the model does not fit: 14% of the matrix remain" in sprint._notes.text()
+    assert f"Usable: {words}" in procedure.verdict.text()
+    calibrate.refresh()
+    assert f"Usable: {words}" in calibrate.notifications.notifications[-1].text

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from small_matrices import CONFIG, GRID, MODEL, NOISE, TRUTH, measured
-from small_system import SMALL
+from small_system import SMALL, configuration
 
 from escape_hw.calibration.sprint.fit import sprint
 from escape_hw.config.loader import load_system
@@ -64,7 +64,22 @@ def test_it_is_named(change: Change, remark: str) -> None:
 
 
 def test_a_correct_description_has_no_remark() -> None:
-    assert not sprint(measured(0), MODEL).notes
+    estimate = sprint(measured(0), MODEL)
+    assert not estimate.notes
+    assert estimate.model_fits
+    assert estimate.outcome == "converged"
+
+
+def test_a_mirror_of_another_family_converges_but_does_not_fit() -> None:
+    """A thin plate, described as an exponential."""
+    plate = make_fast_model(configuration('devices.dm.influence="thin-plate"'), GRID)
+    true = plate.zonal_matrix(TRUTH)
+    data = true + NOISE * np.random.default_rng(0).normal(size=true.shape)
+    estimate = sprint(replace(measured(0), data=data.astype(np.float32)), MODEL)
+    assert estimate.converged, estimate.warnings
+    assert estimate.model_fits is False
+    assert estimate.outcome == "converged, but the model does not fit"
+    assert estimate.notes[0].startswith("the model does not fit: ")
 
 
 def test_a_wrong_pitch_is_named() -> None:

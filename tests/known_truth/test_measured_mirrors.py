@@ -5,19 +5,23 @@ Its influence functions are rounded exponentials and its slopes have no tip and 
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
 from shared_data import SHARED, shared_data
 
-from escape_benchmarks.measured.dm97 import fit_matrix, read_matrix
+from escape_benchmarks.measured.dm97 import fit_matrix, load_design, read_calibration, read_matrix
 from escape_hw.api.interaction_matrix import InteractionMatrix
-from escape_hw.calibration.sprint.fit import SprintFit
+from escape_hw.api.results import find_outliers
+from escape_hw.api.sensor import SubApertureGrid, require_kind
+from escape_hw.calibration.sprint.fit import SprintFit, sprint
 from escape_hw.config.loader import load_system
-from escape_hw.io.interchange.arrays import import_arrays, read_description
+from escape_hw.io.interchange.arrays import design_geometry, import_arrays, read_description
 from escape_hw.report.comparison import changed_gains
 from escape_hw.runtime.session.array_target import array_target
+from escape_sim.models.factory import make_fast_model
 
 FOLDER = SHARED / "dm97"
 #: One date for each of the three masks.
@@ -46,6 +50,32 @@ def test_the_fit_of_a_measured_mirror_converges(date: str) -> None:
     assert any("tip and tilt" in note for note in fit.estimate.notes)
     left = np.linalg.norm(matrix.data - fit.zonal_matrix()) / np.linalg.norm(matrix.data)
     assert left < 0.08
+
+
+def test_a_mask_that_reaches_beyond_the_described_lenslets_does_not_fit() -> None:
+    """The largest mask on the camera's 29 lenslets across: those at the rim are dark in the model."""
+    date, across = DATES[2], 29
+    config = load_design([
+        f"sensor.n_sub={across}", f"system.pupil_m={across * 0.3e-3}",
+        f"devices.dm.pitches_across_pupil={across * 0.3}",
+    ])  # fmt: skip
+    correct = read_calibration(FOLDER, date)
+    valid = correct.matrix.valid[1:-1, 1:-1]
+    assert valid.sum() == correct.matrix.valid.sum()
+    matrix = replace(correct.matrix, valid=valid)
+    model = make_fast_model(
+        config, require_kind(design_geometry(valid, array_target(config)), SubApertureGrid)
+    )
+    estimate = sprint(matrix, model)
+    assert estimate.converged, estimate.warnings
+    assert estimate.model_fits is False
+    assert any("hardly respond" in note for note in estimate.notes)
+    assert any("the largest residuals are those of sub-apertures" in note for note in estimate.notes)
+    assert find_outliers(estimate.goodness_of_fit.by_sub_aperture)
+    # The errors contain what the misfit does to the registration.
+    fitting = fitted(date)[1].estimate
+    error = estimate.registration.to_array() - fitting.registration.to_array()
+    assert (np.abs(error) < 2 * estimate.sigma).all()
 
 
 @pytest.mark.slow

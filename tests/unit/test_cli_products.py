@@ -31,6 +31,22 @@ def test_show_and_compare(escape, document, im, tmp_path):
     assert "relative rms difference" in escape("compare", im, im)[1]
 
 
+def test_a_model_that_does_not_fit_is_shown(escape, document, tmp_path):
+    poor = save_matrix(tmp_path / "poor.fits", fake.calibration(fits=False), fake.ORIGIN)
+    found = document("show", poor)[1]
+    assert found["converged"]
+    assert found["model_fits"] is False
+    assert found["outcome"] == "converged, but the model does not fit"
+    code, text, _ = escape("show", poor)
+    words = " ".join(text.split())
+    assert code == 0
+    assert "Usable: converged, but the model does not fit (14% of the matrix" in words
+    assert "the model does not fit: 14% of the matrix remain" in words
+    good = save_matrix(tmp_path / "good.fits", fake.calibration(), fake.ORIGIN)
+    assert document("show", good)[1]["model_fits"] is True
+    assert "does not fit" not in escape("show", good)[1]
+
+
 @pytest.mark.usefixtures("reports")
 def test_report_is_built_again_after_the_folder_has_moved(escape, document, tmp_path):
     run = Path(

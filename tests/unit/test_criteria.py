@@ -8,7 +8,7 @@ from dataclasses import replace
 import fake_results as fake
 
 from escape_hw.api.results import Estimate, StrehlEstimate
-from escape_hw.report.tables import strehl_table
+from escape_hw.report.tables import criterion_symbol, strehl_table
 from escape_hw.runtime.procedures import criteria
 
 UNKNOWN = Estimate(0.6, math.nan)
@@ -30,6 +30,17 @@ def test_loops_too_short_for_a_strehl_ratio_do_not_count_as_compared():
     assert met(escape=replace(fake.loop(), strehl=None)) == [True, True, False]
     unknown = StrehlEstimate(UNKNOWN, UNKNOWN, UNKNOWN)
     assert met(escape=replace(fake.loop(), strehl=unknown)) == [True, True, False]
+
+
+def test_a_model_that_does_not_fit_is_met_with_a_limitation():
+    good, poor = (
+        criteria.sprint_converged("ESCAPE", fake.calibration(fits=fits).registration)
+        for fits in (True, False)
+    )
+    assert (good["text"], criterion_symbol(good)) == ("ESCAPE: SPRINT converged", "✓")
+    assert poor["met"]
+    assert poor["text"] == "ESCAPE: SPRINT converged, but the model does not fit"
+    assert criterion_symbol(poor) == "!"
 
 
 def test_a_loop_that_is_not_stable_is_reported_once():

@@ -131,6 +131,8 @@ def test_a_track_is_shown_in_the_papers_units():
     np.testing.assert_allclose(drawn.sigma[:2], [0.1 / 2, 0.1 / 71])
     assert course.headline() == "converged, 2 iterations"
     assert "NOT" in ConvergenceHistory.of(values, None, None, False).headline()
+    poor = ConvergenceHistory.of(values, None, None, True, False)
+    assert poor.normalise().headline() == "converged, but the model does not fit, 2 iterations"
     # Read a moment apart, the streams may differ by an iteration.
     assert np.isnan(ConvergenceHistory.of(values, None, np.array([0.1, 0.2, 0.3, 0.4])[:1]).step_norm[1])
     assert ConvergenceHistory.of(values, None, np.arange(5.0)).step_norm.shape == (2,)

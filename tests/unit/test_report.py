@@ -26,6 +26,7 @@ from escape_hw.report.content import RunContent, read_run
 from escape_hw.report.figures import bench as figures_bench
 from escape_hw.report.figures import matrix as figures_matrix
 from escape_hw.report.figures import registration as figures_registration
+from escape_hw.report.figures import residual as figures_residual
 from escape_hw.report.figures import style
 from escape_hw.report.run_report import draw_picture, write_picture, write_report
 
@@ -98,6 +99,34 @@ class Checker(HTMLParser):
                 self.outside.append(value)
 
 
+def test_page_says_that_the_model_does_not_fit(tmp_path):
+    result = fake.calibration(n=8, n_modes=6, fits=False)
+    with RunFolder("razor-shwfs", "test", tmp_path / "run") as run:
+        run.add_product("escape", save_matrix(run.file("escape.fits"), result))
+        run.write_result({
+            **documents.header_fields("test", "razor-shwfs", True, 1),
+            **documents.calibration_document(result), "warnings": [],
+        })  # fmt: skip
+    text = write_report(run.path).read_text(encoding="utf-8")
+    assert '<p class="verdict usable" role="status">Usable: converged, but the model does not fit' in text
+    assert "<li>the model does not fit: 14% of the matrix remain</li>" in text
+    assert "Residual of the fit: rms over all modes" in text
+
+
+@pytest.mark.parametrize("layout", [fake.layout(), None, np.ones((2, 2), dtype=bool)])
+def test_residual_map_marks_the_outliers(layout):
+    lenslets = fake.grid(8)
+    found = fake.goodness_of_fit(lenslets.n_valid, fits=False)
+    figure = figures_residual.residual_map(found, lenslets.valid, layout)
+    pupil, mirror = figure.axes[:2]
+    assert np.flatnonzero(pupil.collections[0].get_linewidths()).tolist() == [0, 1, 2]
+    assert pupil.get_title().startswith("sub-apertures: median 1, largest")
+    if layout is not None and layout.sum() == 97:
+        assert np.flatnonzero(mirror.collections[0].get_linewidths()).tolist() == [23]
+    else:
+        assert mirror.get_xlabel() == "actuator"
+
+
 def test_page_is_sound_and_self_contained(page):
     checker = Checker()
     checker.feed(page)
@@ -121,7 +150,7 @@ def test_page_shows_everything(page):
         "Influence functions that SPRINT has found",
     ):  # fmt: skip
         assert word in page, word
-    assert page.count("<figure>") == 12
+    assert page.count("<figure>") == 13
     assert "ABORTED" not in page
 
 

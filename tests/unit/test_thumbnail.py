@@ -81,7 +81,7 @@ def estimate() -> RegistrationEstimate:
 def test_a_registration_states_errors_units_and_convergence() -> None:
     html = estimate()._repr_html_()
     assert "1.500 ± 0.200 % of a sub-aperture" in html
-    assert "yes, 4 iterations" in html
+    assert "converged, 4 iterations" in html
     assert "few frames" in html
     assert "<svg" in html
 

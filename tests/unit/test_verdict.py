@@ -19,6 +19,14 @@ ESCAPE = {"converged": True, "iterations": 15, "frames": 600, "snr": {"min": 23.
             "Usable: SNR 0.35 in the worst mode; measure about 44,000 frames",
         ),
         ({"converged": False}, Quality.NOT_USABLE, "Not usable: not converged"),
+        (
+            {"model_fits": False, "misfit": 0.144, "chi2": 22.4},
+            Quality.USABLE,
+            "Usable: converged, but the model does not fit (14% of the matrix beyond its noise, reduced "
+            "chi-squared 22.4); the notes name what does not fit",
+        ),
+        ({"converged": False, "model_fits": False}, Quality.NOT_USABLE, "Not usable: not converged"),
+        ({"model_fits": None}, Quality.GOOD, "Good: SNR 23.8"),
         ({"converged": None, "snr": {"min": 0.35}}, Quality.NOT_USABLE, "SNR 0.35 in the worst mode"),
         ({"converged": None, "snr": {"min": 2.0}}, Quality.USABLE, "measure about 1,400 frames"),
         ({"criteria": [{"text": "loop stable", "met": False}]}, Quality.NOT_USABLE, "not met: loop stable"),

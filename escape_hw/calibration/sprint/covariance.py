@@ -253,4 +253,4 @@ def sandwich_covariance(
     covariance = covariance + _positive_part(by_slopes - estimate)
     resampled = _resampled_covariance(system.information(), scores, system.residual, weighted.modes)
     covariance = covariance + _positive_part(resampled - covariance)
-    return np.asarray(covariance * max(float(np.mean(np.square(system.residual))) / power, 1.0))
+    return np.asarray(covariance * max(weighted.reduced_chi_squared(system.residual) / power, 1.0))

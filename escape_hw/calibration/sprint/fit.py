@@ -24,7 +24,7 @@ from escape_hw.calibration.sprint.covariance import sandwich_covariance, systema
 from escape_hw.calibration.sprint.description_checks import describe_description, estimate_clocking
 from escape_hw.calibration.sprint.diagnostics import describe_degeneracies
 from escape_hw.calibration.sprint.extra_parameters import build_extra_parameters
-from escape_hw.calibration.sprint.goodness_of_fit import check_fit, describe_misfit
+from escape_hw.calibration.sprint.goodness_of_fit import assess_fit, check_fit, describe_misfit
 from escape_hw.calibration.sprint.influence_estimate import estimate_profile
 from escape_hw.calibration.sprint.mixed_effects import GAIN, SHAPE, WIDTH, MixedEffectsState, PriorEstimate
 from escape_hw.calibration.sprint.mode_choice import choose_modes
@@ -188,7 +188,8 @@ def sprint(
     -------
     RegistrationEstimate
         ``converged`` is false when the steps did not become small or the model does not explain the
-        matrix; ``warnings`` states the reason.
+        matrix; ``warnings`` states the reason. ``model_fits`` is false when the model leaves more than the
+        noise and the priors allow; ``notes`` name what does not fit, and the standard errors contain it.
 
     Raises
     ------
@@ -420,12 +421,13 @@ def _build_estimate(
         Estimate(solution.width, float(sigma[WIDTH]) if sigma.size > WIDTH else 0.0),
         len(warnings) == 0,
         tuple(context.history),
-        float(np.mean(np.square(solution.system.residual))),
+        weighted.reduced_chi_squared(solution.system.residual),
         warnings,
         notes,
         extras={one.model.name: one.to_estimate(sigma, model_sigma) for one in solution.extras},
         **_fitted_mirror(context, solution, covariance),
         repeatability_covariance=between_runs * np.outer(share, share),
+        goodness_of_fit=assess_fit(weighted, solution.system.residual),
     )
 
 

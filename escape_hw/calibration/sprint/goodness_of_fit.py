@@ -1,17 +1,21 @@
 """Whether a solution of SPRINT may be used: what does not fit, and where.
 
 A fit counts as converged when its steps ended, the fitted matrix is significant, the registration is within
-what the search covers, the data constrain every parameter, and the model explains the matrix to within its
-noise and a small misfit.
+what the search covers, the data constrain every parameter, and the model explains most of the matrix. The
+model *fits* if what it leaves is what the noise and the priors allow, or too small to matter. A converged fit
+of a model that does not fit gives a registration whose errors contain the misfit.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.registration import PARAMETERS, Registration
+from escape_hw.api.results import GoodnessOfFit, find_outliers
 from escape_hw.api.synthetic_model import SyntheticModel
 from escape_hw.calibration.sprint.coarse_search import MIN_EXPLAINED_FRACTION
 from escape_hw.calibration.sprint.diagnostics import check_orientation
@@ -21,74 +25,140 @@ from escape_hw.calibration.sprint.weighted_matrix import WeightedMatrix
 #: Largest rms of the residual beyond the noise, relative to that of the matrix. A tenth is what the best
 #: known description of a real mirror leaves; beyond it scalings and rotation are those of a wrong model.
 _MAX_MISFIT = 0.15
-#: The same from which on a note tells that the model does not fit to within the noise.
-_NOTABLE_MISFIT = 0.02
-#: Excess of the sum of squares, in its standard deviations for independent noise, that counts as a misfit.
-_SIGNIFICANT = 10.0
+#: The same up to which the model counts as fitting however small the noise: it hardly changes loop gains, and
+#: the response of a mirror changes by about as much between its first minutes and later ones.
+_TOLERATED_MISFIT = 0.02
+#: Mean square of the residual beyond the noise, in variances of the noise, up to which the model counts as
+#: fitting: the standard errors grow by a tenth, to which neither they nor those of the matrix are known.
+_TOLERATED_EXCESS = 0.21
+#: Standard errors that the mean square of the residual must be beyond the noise to count as a misfit.
+_SIGNIFICANT = 3.0
+#: Ratio of the standard deviation of a normal variable to its median absolute deviation.
+_NORMAL_RATIO = 1.4826
 #: Norm of the fitted matrix in standard errors below which the sensor does not see the mirror: the largest of
 #: some hundred starts of a search in pure noise reaches about 5.
 _MIN_SIGNIFICANCE = 10.0
 #: Largest scaling in % and rotation in degrees: the search covers half of them.
 _MAX_SCALING, _MAX_ROTATION = 20.0, 30.0
-#: A sub-aperture or actuator whose rms residual exceeds the median one by this factor is named, so many at
-#: most.
-_OUTLIER, _MAX_NAMED = 3.0, 12
+#: Sub-apertures or actuators with an outlying residual that are named at most.
+_MAX_NAMED = 12
+
+#: Note of a fit that is not judged.
+NOT_JUDGED = "the matrix has no standard errors, so whether the model fits to within its noise is not judged"
 
 
-def misfit_fraction(weighted: WeightedMatrix, residual: NDArray[np.float64]) -> float:
-    """Rms of the residual beyond the noise, relative to that of the matrix; 0 where it is not significant.
+@dataclass(frozen=True, slots=True)
+class Misfit:
+    """Mean square of a residual beyond the noise.
 
     The mean of the residual over a column is left out: vibration during its measurement shifts all slopes
     alike.
 
     Parameters
     ----------
-    weighted
-        The matrix in units of its standard errors; without them all of the residual is misfit.
-    residual
-        Data minus model ``(n_slopes, n_modes)`` in the same units.
+    excess
+        In variances of the noise; without standard errors all of the residual.
+    excess_sigma
+        Its standard error.
+    fraction
+        Rms of the residual beyond the noise, relative to that of the matrix; 0 where it is not significant.
     """
-    n = residual.size if weighted.has_standard_errors else 0
-    excess = float(np.square(remove_tip_tilt(residual)).sum()) - n
-    signal = float(np.square(weighted.data).sum()) - n
-    if excess <= _SIGNIFICANT * np.sqrt(2.0 * n) or signal <= 0:
-        return 0.0
-    return float(np.sqrt(excess / signal))
+
+    excess: float
+    excess_sigma: float
+    fraction: float
+
+    @classmethod
+    def of(cls, weighted: WeightedMatrix, residual: NDArray[np.float64]) -> Misfit:
+        """Of a weighted matrix, and data minus model ``(n_slopes, n_modes)`` in the same units."""
+        square = np.square(remove_tip_tilt(residual))
+        noise = weighted.expected_noise if weighted.has_standard_errors else 0.0
+        excess, signal = float(square.sum()) - noise, float(np.square(weighted.data).sum()) - noise
+        sigma = _error_of_mean(square / weighted.noise_variances[:, None]) if noise else 0.0
+        relative = excess / weighted.expected_noise
+        is_misfit = relative > _SIGNIFICANT * sigma and signal > 0
+        return cls(relative, sigma, float(np.sqrt(excess / signal)) if is_misfit else 0.0)
+
+    @property
+    def matters(self) -> bool:
+        """Whether it is significant, larger than the noise is uncertain, and no small part of the matrix."""
+        return self.fraction > _TOLERATED_MISFIT and self.excess > _TOLERATED_EXCESS
 
 
-def describe_misfit(weighted: WeightedMatrix, residual: NDArray[np.float64]) -> tuple[str, ...]:
-    """A note that the model does not fit to within the noise; empty if it does.
+def _error_of_mean(square: NDArray[np.float64]) -> float:
+    """Standard error of the mean of squares ``(n_slopes, n_modes)``, not less than that of independent noise.
+
+    From their scatter over modes and over sub-apertures (clusters two ways), which contains the correlation
+    of the noise and the uncertainty of the standard errors. Medians, because a misfit of some columns or
+    sub-apertures is what is looked for.
+    """
+    by_mode, by_sub_aperture = square.mean(axis=0), square.mean(axis=1).reshape(2, -1).mean(axis=0)
+    variance = 0.0
+    for part in (by_mode, by_sub_aperture):
+        deviation = _NORMAL_RATIO * float(np.median(np.abs(part - np.median(part))))
+        variance += deviation**2 / part.size
+    return float(np.sqrt(max(variance, 2.0 / square.size)))
+
+
+def assess_fit(weighted: WeightedMatrix, residual: NDArray[np.float64]) -> GoodnessOfFit | None:
+    """Whether the model fits, and what it leaves where; ``None`` without standard errors.
 
     Parameters
     ----------
     weighted, residual
-        As for :func:`misfit_fraction`. Without standard errors the residual may be noise, and none is given.
+        As for :meth:`Misfit.of`. Without standard errors the residual may be noise.
     """
-    misfit = misfit_fraction(weighted, residual) if weighted.has_standard_errors else 0.0
-    if not _NOTABLE_MISFIT < misfit <= _MAX_MISFIT:
+    if not weighted.has_standard_errors:
+        return None
+    misfit = Misfit.of(weighted, residual)
+    return GoodnessOfFit(not misfit.matters, misfit.fraction, *_rms_by_part(weighted, residual))
+
+
+def describe_misfit(weighted: WeightedMatrix, residual: NDArray[np.float64]) -> tuple[str, ...]:
+    """A note that the model does not fit, or that this cannot be judged; empty if it fits.
+
+    Parameters
+    ----------
+    weighted, residual
+        As for :func:`assess_fit`.
+    """
+    if not weighted.has_standard_errors:
+        return (NOT_JUDGED,)
+    misfit = Misfit.of(weighted, residual)
+    if not misfit.matters:
         return ()
+    chi2 = weighted.reduced_chi_squared(residual)
     return (
-        f"the model does not fit to within the noise: {misfit:.0%} of the matrix remain beyond it (reduced "
-        f"chi-squared {np.mean(np.square(residual)):.3g}), which the standard errors include as far as "
-        "leaving out parts of the matrix shows it",
+        f"the model does not fit: {misfit.fraction:.0%} of the matrix remain beyond its noise (reduced "
+        f"chi-squared {chi2:.3g}, {misfit.excess / misfit.excess_sigma:.0f} standard errors above 1); the "
+        f"standard errors of the registration contain a factor of {np.sqrt(chi2):.1f} for it",
     )
+
+
+def _rms_by_part(
+    weighted: WeightedMatrix, residual: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Rms residual of every sub-aperture and of every actuator, in standard errors."""
+    by_slope = np.square(residual).mean(axis=1) / weighted.noise_variances
+    # The column of an actuator is a combination of those of the modes, and its noise that of the combination.
+    inverse = np.linalg.pinv(weighted.modes)
+    noise = np.square(inverse).sum(axis=0) * weighted.noise_variances.mean()
+    power = np.square(residual @ inverse).mean(axis=0)
+    by_actuator = np.divide(power, noise, out=np.zeros_like(power), where=noise > 0)
+    return np.sqrt(by_slope.reshape(2, -1).mean(axis=0)), np.sqrt(by_actuator)
 
 
 def describe_outliers(weighted: WeightedMatrix, residual: NDArray[np.float64]) -> str:
     """Name the sub-apertures and actuators with outlying residuals; empty if there are none."""
-    by_sub_aperture = np.square(residual).sum(axis=1).reshape(2, -1).sum(axis=0)
-    modes = weighted.modes
-    commanded = residual @ np.linalg.pinv(modes)
-    by_actuator = np.square(commanded).sum(axis=0)
+    by_sub_aperture, by_actuator = _rms_by_part(weighted, residual)
     rows, columns = np.nonzero(weighted.valid)
     places = [f"({row}, {column})" for row, column in zip(rows, columns, strict=True)]
     parts = []
-    for kind, power, names in (
+    for kind, rms, names in (
         ("sub-apertures (row, column)", by_sub_aperture, places),
         ("actuators", by_actuator, [str(a) for a in range(len(by_actuator))]),
     ):
-        ratio = np.sqrt(power / max(float(np.median(power)), 1e-300))
-        worst = [k for k in np.argsort(-ratio).tolist() if ratio[k] > _OUTLIER]
+        worst = find_outliers(rms)
         if worst:
             more = f" and {len(worst) - _MAX_NAMED} more" if len(worst) > _MAX_NAMED else ""
             parts.append(f"{kind} {', '.join(names[k] for k in worst[:_MAX_NAMED])}{more}")
@@ -118,7 +188,7 @@ def check_fit(
     """
     reasons = []
     explained, signal = weighted.explained_fraction(residual), weighted.signal_fraction
-    misfit, fitted = misfit_fraction(weighted, residual), weighted.data - residual
+    misfit, fitted = Misfit.of(weighted, residual).fraction, weighted.data - residual
     significance = float(np.linalg.norm(fitted)) / weighted.noise_level(residual)
     if explained < MIN_EXPLAINED_FRACTION * signal or np.vdot(fitted, weighted.data) <= 0:
         hint = check_orientation(matrix, model, columns)
@@ -145,7 +215,7 @@ def check_fit(
         where = f"worst: {outliers}" if outliers else "no part stands out"
         reasons.append(
             f"the model does not fit: {misfit:.0%} of the matrix remain beyond its noise (reduced "
-            f"chi-squared {np.mean(np.square(residual)):.3g}); {where}"
+            f"chi-squared {weighted.reduced_chi_squared(residual):.3g}); {where}"
         )
     return reasons + _implausible_values(registration)
 

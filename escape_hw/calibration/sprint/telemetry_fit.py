@@ -10,7 +10,7 @@ pokes; SPRINT fits that matrix.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -196,7 +196,9 @@ def fit_telemetry(
             priors, n_effective_parameters = prior_estimate.priors, prior_estimate.n_effective_parameters
         if order:
             filters = fit_history_filters(*_residual_slopes(data, matrix, response), order)
-    return TelemetryFit(fit.estimate, response, filters[-1], covariance, n)
+    # The noise is that of the residual of the previous iteration, misfit included.
+    estimate = replace(fit.estimate, goodness_of_fit=None)
+    return TelemetryFit(estimate, response, filters[-1], covariance, n)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.synthetic_model import HasSlopeWeights, SyntheticModel
-from escape_hw.pipeline.statistics import root_mean_square
 
 #: Residual of a sub-aperture, relative to the median one, up to which its weight is 1.
 _HUBER_THRESHOLD = 1.5
@@ -36,6 +35,9 @@ class WeightedMatrix:
         Whether the matrix came with standard errors; if not, they are taken as equal.
     valid
         Valid sub-apertures ``(n_rows, n_columns)``.
+    slope_weights
+        Weights of the squares of the slopes ``(n_slopes,)``, which ``data`` contains: the variance of their
+        noise in its units.
     """
 
     data: NDArray[np.float64]
@@ -44,6 +46,7 @@ class WeightedMatrix:
     m2c: NDArray[np.float64]
     has_standard_errors: bool
     valid: NDArray[np.bool_]
+    slope_weights: NDArray[np.float64] | float = 1.0
 
     @classmethod
     def from_columns(cls, matrix: InteractionMatrix, columns: NDArray[np.intp]) -> WeightedMatrix:
@@ -70,7 +73,10 @@ class WeightedMatrix:
     def with_slope_weights(self, weights: NDArray[np.float64]) -> WeightedMatrix:
         """The same with the squares of every slope multiplied by a weight ``(n_slopes,)``."""
         root = np.sqrt(weights)
-        return replace(self, data=self.data * root[:, None], by_slope=self.by_slope / root)
+        return replace(
+            self, data=self.data * root[:, None], by_slope=self.by_slope / root,
+            slope_weights=self.slope_weights * weights,
+        )  # fmt: skip
 
     @property
     def modes(self) -> NDArray[np.float64]:
@@ -82,15 +88,29 @@ class WeightedMatrix:
         return np.asarray(slopes / self.by_slope[:, None])
 
     @property
+    def noise_variances(self) -> NDArray[np.float64]:
+        """Variance of the noise of every slope ``(n_slopes,)`` in units of the data."""
+        return np.asarray(np.broadcast_to(self.slope_weights, len(self.data)), float)
+
+    @property
+    def expected_noise(self) -> float:
+        """Expected sum of squares of the noise."""
+        return float(self.noise_variances.sum() * self.data.shape[1])
+
+    def reduced_chi_squared(self, residual: NDArray[np.float64]) -> float:
+        """Sum of squares of a residual ``(n_slopes, n_modes)`` relative to that of the noise."""
+        return float(np.square(residual).sum() / self.expected_noise)
+
+    @property
     def signal_fraction(self) -> float:
         """Fraction of the sum of squares that is not noise."""
         if not self.has_standard_errors:
             return 1.0
-        return max(1 - self.data.size / float(np.square(self.data).sum()), 0.0)
+        return max(1 - self.expected_noise / float(np.square(self.data).sum()), 0.0)
 
     def noise_level(self, residual: NDArray[np.float64]) -> float:
         """Noise of an element in units of the data: 1, or the rms residual without standard errors."""
-        return 1.0 if self.has_standard_errors else root_mean_square(residual)
+        return 1.0 if self.has_standard_errors else float(np.sqrt(self.reduced_chi_squared(residual)))
 
     def explained_fraction(self, residual: NDArray[np.float64]) -> float:
         """Fraction of the sum of squares that a model with this residual explains."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 from escape_hw.runtime.procedures.calibration import METHODS
@@ -37,18 +37,21 @@ def _calibration(result: CalibrationResult, document: dict[str, Any]) -> Iterato
     from escape_hw.cli.formatting import format_calibration
 
     yield from format_calibration(result)
-    yield from _registration(result, document)
+    yield from _registration(result, document, result.notes)
 
 
-def _registration(result: CalibrationResult, document: dict[str, Any]) -> Iterator[RenderableType]:
+def _registration(
+    result: CalibrationResult, document: dict[str, Any], shown: Sequence[str] = ()
+) -> Iterator[RenderableType]:
     from escape_hw.api.registration import Registration
-    from escape_hw.cli.formatting import rich_table
+    from escape_hw.cli.formatting import registration_remarks, rich_table
     from escape_hw.report.tables import registration_table
 
     if result.registration is not None:
         injected = document.get("injected")
         known = None if injected is None else Registration(**injected)
         yield rich_table(registration_table({"": result.registration}, known))
+        yield from registration_remarks(result.registration, shown)
 
 
 def _gains(run: GainsRun, document: dict[str, Any]) -> Iterator[RenderableType]:

@@ -30,7 +30,7 @@ def influence(
     The file can be the nominal mirror of the next run: devices.dm.influence = "file".
     """
     from escape_hw.calibration.sprint.influence_estimate import estimate_influence_functions
-    from escape_hw.cli.formatting import profile_lines
+    from escape_hw.cli.formatting import profile_lines, registration_remarks
     from escape_hw.config.loader import load_text
     from escape_hw.config.registry import model_factory
     from escape_hw.io.fits.influence import save_influence
@@ -49,8 +49,8 @@ def influence(
     magnification = dm.pitch_m * dm.pitches_across_pupil / config.system.pupil_m
     origin = replace(config_provenance(config), parents={product.path.name: product.sha256})
     path = save_influence(out, found, matrix.system, matrix.simulated, magnification, origin)
-    if not registration.converged:
-        context.show(f"NOT CONVERGED: {'; '.join(registration.warnings)}")
+    if not registration.converged or registration.model_fits is False:
+        context.show(registration.outcome, *registration_remarks(registration))
     context.show(
         f"influence functions of {len(found.gain)} actuators, {found.surfaces.shape[2]} x "
         f"{found.surfaces.shape[1]} points: {path}",

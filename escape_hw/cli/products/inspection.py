@@ -50,6 +50,7 @@ def _show_run(context: CommandContext, folder: Path) -> None:
         format_criteria,
         format_products,
         format_verdict,
+        registration_remarks,
         rich_table,
         status_line,
     )
@@ -62,6 +63,8 @@ def _show_run(context: CommandContext, folder: Path) -> None:
     context.show(f"{document['command']} on {document['system']}", status_line(run.simulated, run.partial()))
     if run.estimates():
         context.show(rich_table(registration_table(run.estimates(), run.injected)))
+        for estimate in run.estimates().values():
+            context.show(*registration_remarks(estimate))
     for gains in run.gains.values():
         context.show(rich_table(rounds_table(gains)))
     if run.loops:

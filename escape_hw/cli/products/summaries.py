@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from rich.console import RenderableType
 
-from escape_hw.cli.formatting import format_calibration, profile_lines, rich_table
+from escape_hw.cli.formatting import format_calibration, profile_lines, registration_remarks, rich_table
 from escape_hw.errors import ProductError
 from escape_hw.io import documents
 from escape_hw.io.fits.frames import KIND_FRAMES, load_frames
@@ -41,6 +41,7 @@ def _matrix(file: Path) -> ProductSummary:
     lines: list[RenderableType] = [*format_calibration(product.result)]
     if product.registration is not None:
         lines.append(rich_table(registration_table({"": product.registration})))
+        lines += registration_remarks(product.registration, product.result.notes)
     return document, lines
 
 

@@ -18,6 +18,7 @@ from escape_hw.api.registration import PARAMETERS, Registration
 from escape_hw.api.results import (
     ActuatorCorrections,
     Estimate,
+    GoodnessOfFit,
     RegistrationEstimate,
     SprintIteration,
     TemporalResponse,
@@ -204,9 +205,32 @@ def pack_registration(estimate: RegistrationEstimate) -> list[Any]:
         iterations,
         pack_metrics(notes, "ALPHANOT"),
         *([] if between_runs is None else [fits_file.image_extension("REPEATCO", between_runs)]),
+        *([] if estimate.goodness_of_fit is None else _pack_goodness_of_fit(estimate.goodness_of_fit)),
         *([] if estimate.actuator_corrections is None else _pack_actuators(estimate.actuator_corrections)),
         *([] if estimate.influence_profile is None else [pack_profile(estimate.influence_profile)]),
     ]
+
+
+def _pack_goodness_of_fit(found: GoodnessOfFit) -> list[fits.BinTableHDU]:
+    """Residuals of the sub-apertures with what they amount to, and of the actuators."""
+    return [
+        fits_file.table_extension(
+            "RESIDSUB", {"RMS": found.by_sub_aperture}, MODELFIT=found.fits, MISFIT=found.misfit
+        ),
+        fits_file.table_extension("RESIDACT", {"RMS": found.by_actuator}),
+    ]
+
+
+def _unpack_goodness_of_fit(path: Path, hdus: fits.HDUList) -> GoodnessOfFit | None:
+    """``None`` where the fit was not judged, as in products of earlier versions."""
+    if "RESIDSUB" not in hdus:
+        return None
+    fits_file.require_extension(path, hdus, "RESIDACT")
+    header = hdus["RESIDSUB"].header
+    return GoodnessOfFit(
+        bool(header["MODELFIT"]), float(header["MISFIT"]),
+        *(_column(hdus, name, "RMS") for name in ("RESIDSUB", "RESIDACT")),
+    )  # fmt: skip
 
 
 #: Column of the share of a broad component in products of version 0.1.0, among the terms of the shape.
@@ -321,6 +345,7 @@ def unpack_registration(path: Path, hdus: fits.HDUList) -> RegistrationEstimate 
         repeatability_covariance=(
             fits_file.read_array(path, hdus, "REPEATCO", np.float64) if "REPEATCO" in hdus else None
         ),
+        goodness_of_fit=_unpack_goodness_of_fit(path, hdus),
     )
 
 

@@ -34,9 +34,8 @@ def convergence(estimate: RegistrationEstimate, injected: Registration | None = 
     if has_step.any():
         panels[0].set_yscale("log")
     style.style_axes(panels[0]).set_ylabel("relative\nstep norm")
-    state = "converged" if estimate.converged else "NOT converged"
     panels[0].set_title(
-        f"{state} after {len(steps)} iterations, reduced χ² {estimate.chi2:.3g}",
+        f"{estimate.outcome}; {len(steps)} iterations, reduced χ² {estimate.chi2:.3g}",
         loc="left", color=style.INK, fontsize=9.5,
     )  # fmt: skip
     for panel, (name, value) in zip(panels[1:], estimate.parameters().items(), strict=True):

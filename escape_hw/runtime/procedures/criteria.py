@@ -36,8 +36,11 @@ def _readable_name(name: str) -> str:
 
 
 def sprint_converged(label: str, estimate: RegistrationEstimate | None) -> dict[str, Any]:
-    """SPRINT converged."""
-    return criterion(f"{label}: SPRINT converged", estimate is not None and estimate.converged)
+    """SPRINT converged; ``limited`` where it did so without a model that fits."""
+    check = criterion(f"{label}: SPRINT converged", estimate is not None and estimate.converged)
+    if estimate is None or not estimate.converged or estimate.model_fits is not False:
+        return check
+    return {"text": f"{label}: SPRINT {estimate.outcome}", "met": True, "limited": True}
 
 
 def gains_converged(result: GainsResult) -> dict[str, Any]:
