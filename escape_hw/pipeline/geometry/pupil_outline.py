@@ -28,7 +28,9 @@ _DARK_PERCENTILE = 10.0
 _INNER_SHARE = 0.5
 #: Standard error of the radius in lenslets: half of the rounding of the diameter to whole lenslets.
 _RADIUS_SIGMA = 0.25
-#: Residual of the first fit, and standard errors within which the centre is assumed to be.
+#: Starts of the fit around the middle of the light, in lenslets.
+_STARTS = ((0, 0), (2, 0), (-2, 0), (0, 2), (0, -2))
+#: Deviation assumed in the first fit, and standard errors within which the centre is assumed to be.
 _FIRST_RESIDUAL, _N_SIGMA = 0.1, 3.0
 #: Part of a pitch between the centre of a lenslet and the border of the camera region, at least.
 _BORDER = 0.3
@@ -101,8 +103,10 @@ class PupilOutline:
 def fit_pupil_outline(light: LensletLight, n_sub: int, start: tuple[float, float]) -> PupilOutline:
     """Fit a round pupil of about ``n_sub`` lenslets to the light on the lenslets.
 
-    The error of the centre is three standard errors plus the difference of the fitted radius from the
-    nominal one: where part of the rim is dark, one side is placed wrongly, and the centre as much.
+    The error of the centre is three standard errors plus what a difference between the fitted and the nominal
+    radius tells of the rim. A part of the rim at ``r(phi)`` instead of the radius ``R`` changes the fitted
+    radius by the mean of ``r - R`` and the centre by twice the mean of ``(r - R) cos(phi)``: where part of the
+    rim is dark, by up to twice as much. Of this, half a lenslet does not change the numbering.
 
     Parameters
     ----------
@@ -111,9 +115,12 @@ def fit_pupil_outline(light: LensletLight, n_sub: int, start: tuple[float, float
     """
     radius = n_sub / 2
     fit = _RoundPupil(light, radius)
-    first, _ = fit.solve((*start, radius), _FIRST_RESIDUAL)
-    found, sigma = fit.solve(first[:3], fit.residual_rms(first, start))
-    error = _N_SIGMA * sigma[:2] + abs(found[2] - radius)
+    # Starts around the given one: from far away the fit may end in a local minimum.
+    first = [fit.solve((start[0] + x, start[1] + y, radius), _FIRST_RESIDUAL) for x, y in _STARTS]
+    best, _, rms = min(first, key=lambda one: one[2])
+    found, sigma, _ = fit.solve(best[:3], rms)
+    off = abs(float(found[2]) - radius)
+    error = _N_SIGMA * sigma[:2] + max(off, 2 * off - 0.5)
     return PupilOutline((float(found[0]), float(found[1])), (float(error[0]), float(error[1])))
 
 
@@ -129,8 +136,11 @@ class _RoundPupil:
 
     def solve(
         self, start: tuple[float, ...] | NDArray[np.float64], residual: float
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Parameters, centre and radius first, and the standard errors of these three."""
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+        """Parameters, centre and radius first, the standard errors of these three, and rms residual.
+
+        ``residual`` is the standard error of the deviations.
+        """
         used, terms = self._outer_part(start)
         bright = used & (self._flux > 3 * self._dark)
         beam = np.linalg.lstsq(terms[bright], np.log(self._flux[bright]), rcond=None)[0]
@@ -141,13 +151,9 @@ class _RoundPupil:
 
         solution = optimize.least_squares(residuals, np.concatenate([start, beam]))
         covariance = np.linalg.pinv(solution.jac.T @ solution.jac, hermitian=True)
-        return solution.x, np.sqrt(np.diag(covariance)[:3])
-
-    def residual_rms(self, parameters: NDArray[np.float64], start: tuple[float, float]) -> float:
-        """Rms deviation of a solution that was started at ``start``."""
-        used, terms = self._outer_part(start)
-        deviations = self._deviations(parameters, used, terms)
-        return float(np.sqrt(np.square(deviations).sum() / max(deviations.size - parameters.size, 1)))
+        square = np.square(solution.fun[:-1] * residual).sum()
+        rms = float(np.sqrt(square / max(solution.fun.size - solution.x.size, 1)))
+        return solution.x, np.sqrt(np.diag(covariance)[:3]), rms
 
     def _outer_part(
         self, centre: tuple[float, ...] | NDArray[np.float64]
