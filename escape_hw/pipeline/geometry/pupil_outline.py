@@ -22,8 +22,9 @@ _POINTS = 4
 #: Share of the brightest neighbour's light below which a lenslet counts as dark. A window receives a few
 #: hundredths from the lenslets around it by diffraction.
 _DARK_SHARE = 0.1
-#: Percentile of the light that counts as darkness: a round pupil leaves a fifth of its square dark.
-_DARK_PERCENTILE = 10.0
+#: Light that counts as darkness, relative to a bright lenslet: at least what many lenslets together scatter,
+#: and a percentile, where a round pupil leaves a fifth of its square dark.
+_LEAST_LIGHT, _DARK_PERCENTILE = 0.02, 10.0
 #: Share of the pupil's radius that is left out, where an obscuration may be.
 _INNER_SHARE = 0.5
 #: Standard error of the radius in lenslets: half of the rounding of the diameter to whole lenslets.
@@ -31,7 +32,9 @@ _RADIUS_SIGMA = 0.25
 #: Starts of the fit around the middle of the light, in lenslets.
 _STARTS = ((0, 0), (2, 0), (-2, 0), (0, 2), (0, -2))
 #: Deviation assumed in the first fit, and standard errors within which the centre is assumed to be.
-_FIRST_RESIDUAL, _N_SIGMA = 0.1, 3.0
+_FIRST_RMS, _N_SIGMA = 0.1, 3.0
+#: Deviation of a lenslet that is lit but dark in the model, or dark but lit.
+_CONTRADICTION = 0.5
 #: Part of a pitch between the centre of a lenslet and the border of the camera region, at least.
 _BORDER = 0.3
 
@@ -106,7 +109,8 @@ def fit_pupil_outline(light: LensletLight, n_sub: int, start: tuple[float, float
     The error of the centre is three standard errors plus what a difference between the fitted and the nominal
     radius tells of the rim. A part of the rim at ``r(phi)`` instead of the radius ``R`` changes the fitted
     radius by the mean of ``r - R`` and the centre by twice the mean of ``(r - R) cos(phi)``: where part of the
-    rim is dark, by up to twice as much. Of this, half a lenslet does not change the numbering.
+    rim is dark, by up to twice as much. Of this, half a lenslet does not change the numbering. ``N`` lenslets
+    that contradict the fit are an area of the rim that may likewise move the centre by ``N / (pi R)``.
 
     Parameters
     ----------
@@ -116,12 +120,31 @@ def fit_pupil_outline(light: LensletLight, n_sub: int, start: tuple[float, float
     radius = n_sub / 2
     fit = _RoundPupil(light, radius)
     # Starts around the given one: from far away the fit may end in a local minimum.
-    first = [fit.solve((start[0] + x, start[1] + y, radius), _FIRST_RESIDUAL) for x, y in _STARTS]
-    best, _, rms = min(first, key=lambda one: one[2])
-    found, sigma, _ = fit.solve(best[:3], rms)
-    off = abs(float(found[2]) - radius)
-    error = _N_SIGMA * sigma[:2] + max(off, 2 * off - 0.5)
-    return PupilOutline((float(found[0]), float(found[1])), (float(error[0]), float(error[1])))
+    first = min(
+        (fit.solve((start[0] + x, start[1] + y, radius), _FIRST_RMS) for x, y in _STARTS),
+        key=lambda one: one.rms,
+    )
+    found = fit.solve(first.parameters[:3], first.rms)
+    off = abs(float(found.parameters[2]) - radius)
+    contradicted = int((np.abs(found.deviations) > _CONTRADICTION).sum())
+    error = _N_SIGMA * found.sigma + max(off, 2 * off - 0.5) + contradicted / (math.pi * radius)
+    x, y = found.parameters[:2].tolist()
+    return PupilOutline((x, y), (float(error[0]), float(error[1])))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Solution:
+    """Parameters, centre and radius first; standard errors of the centre; deviations of the lenslets."""
+
+    parameters: NDArray[np.float64]
+    sigma: NDArray[np.float64]
+    deviations: NDArray[np.float64]
+
+    @property
+    def rms(self) -> float:
+        """Rms deviation."""
+        degrees = max(self.deviations.size - self.parameters.size, 1)
+        return float(np.sqrt(np.square(self.deviations).sum() / degrees))
 
 
 class _RoundPupil:
@@ -131,29 +154,22 @@ class _RoundPupil:
         self._flux, self._radius = light.flux, nominal_radius
         (n_rows, n_columns), (column, row) = light.flux.shape, light.first
         self._columns, self._rows = column + np.arange(n_columns), row + np.arange(n_rows)
-        self._dark = max(float(np.percentile(light.flux, _DARK_PERCENTILE)), 1e-6)
+        self._dark = max(float(np.percentile(light.flux, _DARK_PERCENTILE)), _LEAST_LIGHT)
         self._scale = self._dark + _DARK_SHARE * ndimage.maximum_filter(light.flux, 3)
 
-    def solve(
-        self, start: tuple[float, ...] | NDArray[np.float64], residual: float
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
-        """Parameters, centre and radius first, the standard errors of these three, and rms residual.
-
-        ``residual`` is the standard error of the deviations.
-        """
+    def solve(self, start: tuple[float, ...] | NDArray[np.float64], rms: float) -> _Solution:
+        """Fit from a centre and radius, with deviations of an expected ``rms``."""
         used, terms = self._outer_part(start)
         bright = used & (self._flux > 3 * self._dark)
         beam = np.linalg.lstsq(terms[bright], np.log(self._flux[bright]), rcond=None)[0]
 
         def residuals(parameters: NDArray[np.float64]) -> NDArray[np.float64]:
             prior = (parameters[2] - self._radius) / _RADIUS_SIGMA
-            return np.append(self._deviations(parameters, used, terms) / residual, prior)
+            return np.append(self._deviations(parameters, used, terms) / rms, prior)
 
         solution = optimize.least_squares(residuals, np.concatenate([start, beam]))
         covariance = np.linalg.pinv(solution.jac.T @ solution.jac, hermitian=True)
-        square = np.square(solution.fun[:-1] * residual).sum()
-        rms = float(np.sqrt(square / max(solution.fun.size - solution.x.size, 1)))
-        return solution.x, np.sqrt(np.diag(covariance)[:3]), rms
+        return _Solution(solution.x, np.sqrt(np.diag(covariance)[:2]), solution.fun[:-1] * rms)
 
     def _outer_part(
         self, centre: tuple[float, ...] | NDArray[np.float64]
