@@ -11,6 +11,9 @@ from typing import Any, TypeGuard
 #: Signal-to-noise ratio of the worst mode from which a measured matrix is good, and usable.
 GOOD_SNR, USABLE_SNR = 3.0, 1.0
 
+#: Standard error of a shift from which on it is usable only: a whole sub-aperture, in %.
+UNCERTAIN_SHIFT = 100.0
+
 
 class Quality(IntEnum):
     """Quality of a result, the worst last."""
@@ -77,6 +80,7 @@ def _problems(document: Mapping[str, Any]) -> Iterator[Verdict]:
         if not criterion.get("met", True) and not (alarms and text.startswith("no alarms")):
             yield Verdict(Quality.NOT_USABLE, f"not met: {text}", "see the report")
     yield from _noisy_modes(document)
+    yield from _uncertain_shifts(document)
     if document.get("partial"):
         after = f" after {frames:,} frames" if _is_number(frames := document.get("frames")) else ""
         yield Verdict(Quality.USABLE, f"the run was aborted{after}", "run it again")
@@ -86,6 +90,16 @@ def _problems(document: Mapping[str, Any]) -> Iterator[Verdict]:
     if alarms:
         many = f"{len(alarms)} alarms, the last" if len(alarms) > 1 else "an alarm"
         yield Verdict(Quality.USABLE, f"{many}: {alarms[-1].get('text', '')}", "see the report")
+
+
+def _uncertain_shifts(document: Mapping[str, Any]) -> Iterator[Verdict]:
+    """Shifts that may be wrong by a sub-aperture, because the numbering of the lenslets is uncertain."""
+    registration = _mapping(document.get("registration"))
+    for name in ("shift_x", "shift_y"):
+        sigma = _mapping(registration.get(name)).get("sigma")
+        if _is_number(sigma) and sigma >= UNCERTAIN_SHIFT:
+            reason = f"{name} is uncertain by {sigma:.0f} % of a sub-aperture"
+            yield Verdict(Quality.USABLE, reason, "see the notes for the cause")
 
 
 def _noisy_modes(document: Mapping[str, Any]) -> Iterator[Verdict]:

@@ -108,8 +108,8 @@ def fit_pupil_outline(light: LensletLight, n_sub: int, start: tuple[float, float
 
     The error of the centre is three standard errors plus what a difference between the fitted and the nominal
     radius tells of the rim. A part of the rim at ``r(phi)`` instead of the radius ``R`` changes the fitted
-    radius by the mean of ``r - R`` and the centre by twice the mean of ``(r - R) cos(phi)``: where part of the
-    rim is dark, by up to twice as much. Of this, half a lenslet does not change the numbering. ``N`` lenslets
+    radius by the mean of ``r - R`` and the centre by twice the mean of ``(r - R) cos(phi)``: by up to twice as
+    much, where part of the rim is dark. Of this, half a lenslet does not change the numbering. ``N`` lenslets
     that contradict the fit are an area of the rim that may likewise move the centre by ``N / (pi R)``.
 
     Parameters
@@ -175,7 +175,9 @@ class _RoundPupil:
         self, centre: tuple[float, ...] | NDArray[np.float64]
     ) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
         """Lenslets that are used, and the terms of the polynomial ``(n_rows, n_columns, 6)``."""
-        x, y = np.meshgrid((self._columns - centre[0]) / self._radius, (self._rows - centre[1]) / self._radius)
+        x, y = np.meshgrid(
+            (self._columns - centre[0]) / self._radius, (self._rows - centre[1]) / self._radius
+        )
         terms = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
         return np.hypot(x, y) > _INNER_SHARE, terms
 
