@@ -79,8 +79,8 @@ def _problems(document: Mapping[str, Any]) -> Iterator[Verdict]:
         # Alarms are judged below.
         if not criterion.get("met", True) and not (alarms and text.startswith("no alarms")):
             yield Verdict(Quality.NOT_USABLE, f"not met: {text}", "see the report")
-    yield from _noisy_modes(document)
     yield from _uncertain_shifts(document)
+    yield from _noisy_modes(document)
     if document.get("partial"):
         after = f" after {frames:,} frames" if _is_number(frames := document.get("frames")) else ""
         yield Verdict(Quality.USABLE, f"the run was aborted{after}", "run it again")

@@ -1,8 +1,8 @@
 """Effect of an uncertain numbering of the sub-apertures on the registration.
 
-A matrix does not show which lenslet of the camera's lattice is the first one of the pupil: with the next one the
-mirror is shifted by a sub-aperture less. Where the light on the sensor does not exclude that, the errors of the
-shift contain it.
+A matrix does not show which lenslet of the camera's lattice is the first one of the pupil: with the next one
+the mirror is shifted by a sub-aperture less. Where the light on the sensor does not exclude that, the errors
+of the shift contain it.
 """
 
 from __future__ import annotations
@@ -41,8 +41,8 @@ def describe_numbering(model: SyntheticModel, registration: Registration) -> tup
         closest = min((0, *others), key=lambda k: abs(shift - 100 * k))
         smallest = "this one" if closest == 0 else f"{closest:+d}"
         notes.append(
-            f"the numbering of the lenslets along {axis} is uncertain: the light on the sensor does not exclude "
-            f"an offset of {listed}; the shift is smallest with {smallest}, and its error includes them. To "
+            f"the numbering of the lenslets along {axis} is uncertain: the light on the sensor does not "
+            f"exclude an offset of {listed}; the shift is smallest with {smallest}, and its error includes them. To "
             "exclude them, centre or widen the beam, show the whole pupil in devices.wfs.region, and check "
             "sensor.n_sub"
         )

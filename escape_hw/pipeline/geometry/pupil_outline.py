@@ -108,9 +108,9 @@ def fit_pupil_outline(light: LensletLight, n_sub: int, start: tuple[float, float
 
     The error of the centre is three standard errors plus what a difference between the fitted and the nominal
     radius tells of the rim. A part of the rim at ``r(phi)`` instead of the radius ``R`` changes the fitted
-    radius by the mean of ``r - R`` and the centre by twice the mean of ``(r - R) cos(phi)``: by up to twice as
-    much, where part of the rim is dark. Of this, half a lenslet does not change the numbering. ``N`` lenslets
-    that contradict the fit are an area of the rim that may likewise move the centre by ``N / (pi R)``.
+    radius by the mean of ``r - R`` and the centre by twice the mean of ``(r - R) cos(phi)``, where part of
+    the rim is dark by up to twice as much. Of this, half a lenslet does not change the numbering. ``N``
+    lenslets that contradict the fit are an area that may likewise move the centre by ``N / (pi R)``.
 
     Parameters
     ----------
