@@ -118,13 +118,29 @@ def test_errors_of_the_registration_include_whole_sub_apertures() -> None:
     assert np.abs(certain.registration.shift_x - TRUTH.shift_x) < 5 * certain.sigma[0]
 
 
-def test_a_renumbered_grid_has_the_stated_shift() -> None:
-    """With the next lenslet as the first one, the mirror is shifted by a sub-aperture less."""
-    offsets = ((-1, 2), (0, 0))
-    model = make_fast_model(CONFIG, replace(GRID, numbering_offsets=offsets))
-    estimate = sprint(measured(0), model)
-    assert estimate.sigma[0] == pytest.approx(200, rel=0.01)
-    assert "smallest with this one" in estimate.notes[0]
+def renumbered_grid(grid: SubApertureGrid, valid: NDArray[np.bool_], offset: int) -> SubApertureGrid:
+    """The same lenslets, those of column ``offset`` being the first ones."""
+    moved, (x, y) = np.roll(valid, -offset, axis=1), grid.origin_px
+    flux = np.roll(grid.flux, -offset, axis=1)
+    return replace(
+        grid, valid=moved, references_px=np.zeros((int(valid.sum()), 2), np.float32), flux=flux,
+        origin_px=(x + offset * grid.pitch_px, y), numbering_offsets=((-offset, 0), (0, 0)),
+    )  # fmt: skip
+
+
+def test_the_next_lenslet_as_the_first_one_has_the_shift_of_the_note() -> None:
+    inner = GRID.valid.copy()
+    inner[:, [0, -1]] = False
+    used = np.tile(inner[GRID.valid], 2)
+    matrix = measured(0)
+    matrix = replace(matrix, data=matrix.data[used], sigma=matrix.sigma[used], valid=inner)
+    here = sprint(matrix, make_fast_model(CONFIG, renumbered_grid(GRID, inner, 0)))
+    grid = renumbered_grid(GRID, inner, 1)
+    there = sprint(replace(matrix, valid=grid.valid), make_fast_model(CONFIG, grid))
+    # The lenslets at the rim of the design's pupil are others.
+    assert there.registration.shift_x == pytest.approx(here.registration.shift_x - 100, abs=10)
+    assert abs(there.registration.shift_x + 100 - TRUTH.shift_x) < there.sigma[0]
+    assert "the shift is smallest with -1" in there.notes[0]
 
 
 def test_products_keep_the_competing_numberings() -> None:
