@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,7 +13,6 @@ from small_matrices import CONFIG, GRID, MODEL, TRUTH, measured
 from escape_hw.api.sensor import SubApertureGrid
 from escape_hw.calibration.sprint.fit import sprint
 from escape_hw.io.documents import registration_document
-from escape_hw.io.fits import extensions
 from escape_hw.pipeline.geometry.lenslet_grid import find_lenslet_grid
 from escape_hw.report.verdict import Quality, assess
 from escape_sim.models.factory import make_fast_model
@@ -141,13 +139,3 @@ def test_the_next_lenslet_as_the_first_one_has_the_shift_of_the_note() -> None:
     assert there.registration.shift_x == pytest.approx(here.registration.shift_x - 100, abs=10)
     assert abs(there.registration.shift_x + 100 - TRUTH.shift_x) < there.sigma[0]
     assert "the shift is smallest with -1" in there.notes[0]
-
-
-def test_products_keep_the_competing_numberings() -> None:
-    from astropy.io import fits
-
-    grid = replace(GRID, numbering_offsets=((-1, 0), (0, 2)))
-    hdus = fits.HDUList([fits.PrimaryHDU(), *extensions.pack_grid(grid)])
-    back = extensions.unpack_grid(Path("grid.fits"), hdus)
-    assert isinstance(back, SubApertureGrid)
-    assert back.numbering_offsets == ((-1, 0), (0, 2))
