@@ -43,7 +43,7 @@ def describe_numbering(model: SyntheticModel, registration: Registration) -> tup
         notes.append(
             f"the numbering of the lenslets along {axis} is uncertain: the light on the sensor does not "
             f"exclude an offset of {listed}; the shift is smallest with {smallest}, and its error includes "
-            "them. To exclude them, centre or widen the beam, show the whole pupil in devices.wfs.region, and "
-            "check sensor.n_sub"
+            "them. To exclude them, centre or widen the beam, show the whole pupil in devices.wfs.region, "
+            "and check sensor.n_sub"
         )
     return tuple(notes)

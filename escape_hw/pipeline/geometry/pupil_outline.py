@@ -25,6 +25,8 @@ _DARK_SHARE = 0.1
 #: Light that counts as darkness, relative to a bright lenslet: at least what many lenslets together scatter,
 #: and a percentile, where a round pupil leaves a fifth of its square dark.
 _LEAST_LIGHT, _DARK_PERCENTILE = 0.02, 10.0
+#: Noise of the dark lenslets, in units of the first percentile of all, which is about -2 standard errors.
+_NOISE = 2.0
 #: Share of the pupil's radius that is left out, where an obscuration may be.
 _INNER_SHARE = 0.5
 #: Standard error of the radius in lenslets: half of the rounding of the diameter to whole lenslets.
@@ -46,7 +48,7 @@ class LensletLight:
     Parameters
     ----------
     flux
-        ``(n_rows, n_columns)``, relative to a bright one.
+        ``(n_rows, n_columns)``, relative to a bright one; negative by noise where there is no light.
     first
         Column and row of the first one on the lattice.
     """
@@ -69,7 +71,7 @@ class LensletLight:
         top, end, left, right = subaperture_windows(centres, pitch, (image.shape[0], image.shape[1])).T
         area = np.pad(image.cumsum(0).cumsum(1), ((1, 0), (1, 0)))
         flux = area[end, right] - area[top, right] - area[end, left] + area[top, left]
-        flux = np.maximum(flux, 0.0).reshape(rows.size, columns.size)
+        flux = flux.reshape(rows.size, columns.size)
         return cls(flux / max(float(np.percentile(flux, 99)), 1e-12), (int(columns[0]), int(rows[0])))
 
 
@@ -151,11 +153,12 @@ class _RoundPupil:
     """Least-squares fit of centre, radius and the six coefficients of the logarithm of the beam."""
 
     def __init__(self, light: LensletLight, nominal_radius: float) -> None:
-        self._flux, self._radius = light.flux, nominal_radius
+        self._flux, self._radius = np.maximum(light.flux, 0.0), nominal_radius
         (n_rows, n_columns), (column, row) = light.flux.shape, light.first
         self._columns, self._rows = column + np.arange(n_columns), row + np.arange(n_rows)
-        self._dark = max(float(np.percentile(light.flux, _DARK_PERCENTILE)), _LEAST_LIGHT)
-        self._scale = self._dark + _DARK_SHARE * ndimage.maximum_filter(light.flux, 3)
+        lowest, dark = np.percentile(light.flux, (1.0, _DARK_PERCENTILE))
+        self._dark = max(float(dark), -_NOISE * float(lowest), _LEAST_LIGHT)
+        self._scale = self._dark + _DARK_SHARE * ndimage.maximum_filter(self._flux, 3)
 
     def solve(self, start: tuple[float, ...] | NDArray[np.float64], rms: float) -> _Solution:
         """Fit from a centre and radius, with deviations of an expected ``rms``."""
