@@ -85,9 +85,18 @@ def test_a_region_that_cuts_the_pupil_leaves_the_numbering() -> None:
         PUPIL * (X > -9),
         PUPIL * ~((np.hypot(X, Y) > 9.6) & (np.abs(np.arctan2(Y, X)) < 0.9)),
         PUPIL * beam(5),
+        PUPIL * beam(3),
         np.ones_like(X),
     ],
-    ids=["second aperture", "second aperture far off", "straight edge", "opaque dirt", "dark rim", "no rim"],
+    ids=[
+        "second aperture",
+        "second aperture far off",
+        "straight edge",
+        "opaque dirt",
+        "dim rim",
+        "dark rim",
+        "no rim",
+    ],
 )
 def test_an_ambiguous_outline_is_stated(amplitude: NDArray[np.floating]) -> None:
     grid, off = find(amplitude)

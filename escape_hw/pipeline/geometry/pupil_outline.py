@@ -33,6 +33,8 @@ _INNER_SHARE = 0.5
 _RADIUS_SIGMA = 0.25
 #: Starts of the fit around the middle of the light, in lenslets.
 _STARTS = ((0, 0), (2, 0), (-2, 0), (0, 2), (0, -2))
+#: Least deviation: where hardly any lenslet outside the inner part is lit, all agree with a dark model.
+_LEAST_RMS = 0.1
 #: Deviation assumed in the first fit, and standard errors within which the centre is assumed to be.
 _FIRST_RMS, _N_SIGMA = 0.1, 3.0
 #: Deviation of a lenslet that is lit but dark in the model, or dark but lit.
@@ -126,7 +128,7 @@ def fit_pupil_outline(light: LensletLight, n_sub: int, start: tuple[float, float
         (fit.solve((start[0] + x, start[1] + y, radius), _FIRST_RMS) for x, y in _STARTS),
         key=lambda one: one.rms,
     )
-    found = fit.solve(first.parameters[:3], first.rms)
+    found = fit.solve(first.parameters[:3], max(first.rms, _LEAST_RMS))
     off = abs(float(found.parameters[2]) - radius)
     contradicted = int((np.abs(found.deviations) > _CONTRADICTION).sum())
     error = _N_SIGMA * found.sigma + max(off, 2 * off - 0.5) + contradicted / (math.pi * radius)
@@ -167,12 +169,14 @@ class _RoundPupil:
         beam = np.linalg.lstsq(terms[bright], np.log(self._flux[bright]), rcond=None)[0]
 
         def residuals(parameters: NDArray[np.float64]) -> NDArray[np.float64]:
-            prior = (parameters[2] - self._radius) / _RADIUS_SIGMA
+            # A centre that no light on the rim determines is anywhere in the pupil.
+            anywhere = (parameters[:2] - start[:2]) / self._radius
+            prior = [*anywhere, (parameters[2] - self._radius) / _RADIUS_SIGMA]
             return np.append(self._deviations(parameters, used, terms) / rms, prior)
 
         solution = optimize.least_squares(residuals, np.concatenate([start, beam]))
         covariance = np.linalg.pinv(solution.jac.T @ solution.jac, hermitian=True)
-        return _Solution(solution.x, np.sqrt(np.diag(covariance)[:2]), solution.fun[:-1] * rms)
+        return _Solution(solution.x, np.sqrt(np.diag(covariance)[:2]), solution.fun[:-3] * rms)
 
     def _outer_part(
         self, centre: tuple[float, ...] | NDArray[np.float64]
