@@ -166,6 +166,10 @@ class SubApertureGrid(SensorGeometry):
         Rms surface of the random pokes, all modes, as fraction of full stroke; 0 without random pokes.
     pixel_noise
         Rms noise of a pixel without light in one frame, in counts; 0 if unknown.
+    numbering_offsets
+        Least and largest offset, along x and along y, of the other numberings that the light does not
+        exclude: with +1 along x the first column of the pupil's lenslets may be the next one. 0 if there are
+        none.
     """
 
     kind: ClassVar[str] = "shack-hartmann"
@@ -187,6 +191,7 @@ class SubApertureGrid(SensorGeometry):
     turbulence_px: float = 0.0
     pokes: float = 0.0
     pixel_noise: float = 0.0
+    numbering_offsets: tuple[tuple[int, int], tuple[int, int]] = ((0, 0), (0, 0))
     __repr__ = short_repr
 
     def centres_px(self) -> NDArray[np.float64]:

@@ -125,6 +125,15 @@ class HasSystematicError(Protocol):
 
 
 @runtime_checkable
+class HasNumberingOffsets(Protocol):
+    """A model whose sub-apertures may be numbered wrongly on the camera."""
+
+    @property
+    def numbering_offsets(self) -> tuple[tuple[int, int], tuple[int, int]]:
+        """Competing numberings, see :class:`~escape_hw.api.sensor.SubApertureGrid`."""
+
+
+@runtime_checkable
 class HasGainTrend(Protocol):
     """A model with an uncertain radial trend of the slope gains."""
 

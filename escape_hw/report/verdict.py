@@ -13,6 +13,9 @@ from escape_hw.api.results import describe_outcome
 #: Signal-to-noise ratio of the worst mode from which a measured matrix is good, and usable.
 GOOD_SNR, USABLE_SNR = 3.0, 1.0
 
+#: Standard error of a shift from which on it is usable only: a whole sub-aperture, in %.
+UNCERTAIN_SHIFT = 100.0
+
 
 class Quality(IntEnum):
     """Quality of a result, the worst last."""
@@ -84,6 +87,7 @@ def _problems(document: Mapping[str, Any]) -> Iterator[Verdict]:
         # Alarms are judged below.
         if not criterion.get("met", True) and not (alarms and text.startswith("no alarms")):
             yield Verdict(Quality.NOT_USABLE, f"not met: {text}", "see the report")
+    yield from _uncertain_shifts(document)
     yield from _noisy_modes(document)
     if document.get("partial"):
         after = f" after {frames:,} frames" if _is_number(frames := document.get("frames")) else ""
@@ -102,6 +106,16 @@ def _describe_residual(document: Mapping[str, Any]) -> str:
     if not _is_number(misfit) or not _is_number(chi2):
         return ""
     return f" ({misfit:.0%} of the matrix beyond its noise, reduced chi-squared {chi2:.3g})"
+
+
+def _uncertain_shifts(document: Mapping[str, Any]) -> Iterator[Verdict]:
+    """Shifts that may be wrong by a sub-aperture, because the numbering of the lenslets is uncertain."""
+    registration = _mapping(document.get("registration"))
+    for name in ("shift_x", "shift_y"):
+        sigma = _mapping(registration.get(name)).get("sigma")
+        if _is_number(sigma) and sigma >= UNCERTAIN_SHIFT:
+            reason = f"{name} is uncertain by {sigma:.0f} % of a sub-aperture"
+            yield Verdict(Quality.USABLE, reason, "see the notes for the cause")
 
 
 def _noisy_modes(document: Mapping[str, Any]) -> Iterator[Verdict]:

@@ -29,6 +29,7 @@ from escape_hw.calibration.sprint.influence_estimate import estimate_profile
 from escape_hw.calibration.sprint.mixed_effects import GAIN, SHAPE, WIDTH, MixedEffectsState, PriorEstimate
 from escape_hw.calibration.sprint.mode_choice import choose_modes
 from escape_hw.calibration.sprint.normal_equations import NormalEquations, Priors
+from escape_hw.calibration.sprint.numbering import describe_numbering, numbering_covariance
 from escape_hw.calibration.sprint.repeatability import repeatability_covariance
 from escape_hw.calibration.sprint.solvers import MAX_STEP, SolverContext, SprintSolution, solve
 from escape_hw.calibration.sprint.tip_tilt import TipTiltFreeModel, is_tip_tilt_removed
@@ -410,23 +411,24 @@ def _build_estimate(
     # Differences between runs are not less certain than the registration itself.
     share = np.minimum(1.0, sigma[1:6] / np.sqrt(np.diag(between_runs)))
     warnings = check_convergence(context, weighted, solution, sigma[1:6])
+    registration = Registration.from_array(solution.alpha)
     if not warnings:
-        registration = Registration.from_array(solution.alpha)
         residual = solution.system.residual
         notes += tuple(describe_description(weighted, residual, registration, solution.state))
+    numbering = numbering_covariance(context.model)
     return RegistrationEstimate(
-        Registration.from_array(solution.alpha),
-        covariance[1:6, 1:6],
+        registration,
+        covariance[1:6, 1:6] + numbering,
         Estimate(solution.gain, float(sigma[GAIN])),
         Estimate(solution.width, float(sigma[WIDTH]) if sigma.size > WIDTH else 0.0),
         len(warnings) == 0,
         tuple(context.history),
         weighted.reduced_chi_squared(solution.system.residual),
         warnings,
-        notes,
+        (*describe_numbering(context.model, registration), *notes),
         extras={one.model.name: one.to_estimate(sigma, model_sigma) for one in solution.extras},
         **_fitted_mirror(context, solution, covariance),
-        repeatability_covariance=between_runs * np.outer(share, share),
+        repeatability_covariance=between_runs * np.outer(share, share) + numbering,
         goodness_of_fit=assess_fit(weighted, solution.system.residual),
     )
 

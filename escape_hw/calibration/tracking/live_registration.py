@@ -31,6 +31,7 @@ from escape_hw.calibration.sprint.mixed_effects import (
     MixedEffectsState,
 )
 from escape_hw.calibration.sprint.normal_equations import NormalEquations, Priors
+from escape_hw.calibration.sprint.numbering import numbering_covariance
 from escape_hw.calibration.sprint.synthetic_matrix import compute_fitted_matrix
 from escape_hw.calibration.sprint.telemetry_fit import fit_whitener
 from escape_hw.calibration.sprint.weighted_matrix import WeightedMatrix, apply_model_weights
@@ -278,7 +279,7 @@ class LiveRegistration:
         sigma = np.sqrt(np.diag(np.linalg.inv(system.information())))
         estimate = RegistrationEstimate(
             Registration.from_array(present.value[1:6]),
-            present.covariance[1:6, 1:6],
+            present.covariance[1:6, 1:6] + numbering_covariance(self._model),
             Estimate(float(gain), gain_sigma),
             Estimate(1 + state.width, float(sigma[WIDTH])),
             True,

@@ -44,18 +44,29 @@ _CARDS: dict[str, dict[str, str]] = {
 }  # fmt: skip
 
 
+#: Header cards of ``SubApertureGrid.numbering_offsets``: least and largest along x, then along y.
+_NUMBERING = ("NUMBXMIN", "NUMBXMAX", "NUMBYMIN", "NUMBYMAX")
+
+
 def geometry_cards(geometry: SensorGeometry) -> dict[str, float | str]:
     """Scalars of a geometry by FITS keyword."""
     values = {key: getattr(geometry, name) for key, name in _CARDS[geometry.kind].items()}
     if isinstance(geometry, SubApertureGrid):
         values |= {"ORIGINX": geometry.origin_px[0], "ORIGINY": geometry.origin_px[1]}
+        values |= dict(zip(_NUMBERING, np.ravel(geometry.numbering_offsets), strict=True))
     return {key: value if isinstance(value, str) else float(value) for key, value in values.items()}
 
 
 def geometry_fields(kind: str, cards: Mapping[str, Any]) -> dict[str, Any]:
     """Inverse of :func:`geometry_cards` but for the origin: arguments of the geometry, where given."""
     found = {name: cards[key] for key, name in _CARDS[kind].items() if key in cards}
-    return {name: value if isinstance(value, str) else float(value) for name, value in found.items()}
+    fields: dict[str, Any] = {
+        name: value if isinstance(value, str) else float(value) for name, value in found.items()
+    }
+    if kind == SubApertureGrid.kind:
+        offsets = [int(cards.get(key, 0)) for key in _NUMBERING]
+        fields["numbering_offsets"] = (tuple(offsets[:2]), tuple(offsets[2:]))
+    return fields
 
 
 def reference_slopes(geometry: SensorGeometry) -> NDArray[np.float32]:

@@ -10,6 +10,7 @@ from scipy import ndimage, optimize
 
 from escape_hw.api.sensor import SubApertureGrid
 from escape_hw.errors import CalibrationError
+from escape_hw.pipeline.geometry.pupil_outline import LensletLight, PupilOutline, fit_pupil_outline
 from escape_hw.pipeline.slopes.shack_hartmann import ShackHartmannSlopes, subaperture_windows
 
 #: Largest relative deviation of the pitch from the nominal one.
@@ -148,7 +149,9 @@ def find_lenslet_grid(
             "no light above the threshold on the wavefront sensor; check source and exposure"
         )
     pitch, x, y = _pitch_and_phase(light, nominal_pitch_px)
-    x, y = _centre_lattice(light, pitch, x, y, n_sub)
+    outline = _find_pupil(image, light, pitch, (x, y), n_sub)
+    column, row = outline.first_lenslet(n_sub)
+    x, y = x + column * pitch, y + row * pitch
     for _ in range(3):
         grid = _build_grid(image, n_sub, pitch, (x, y), min_flux)
         spots = grid.centres_px() + _measure_spots(grid, light)
@@ -160,7 +163,7 @@ def find_lenslet_grid(
         grid = _with_valid(grid, valid)
     if references == "mean":
         grid = replace(grid, references_px=_measure_spots(grid, light).astype(np.float32))
-    return grid
+    return replace(grid, numbering_offsets=outline.competing_offsets(n_sub))
 
 
 def _without_hot_pixels(image: NDArray[np.float64], n_sub: int) -> NDArray[np.float64]:
@@ -179,29 +182,30 @@ def _without_hot_pixels(image: NDArray[np.float64], n_sub: int) -> NDArray[np.fl
     return np.where(hot, brightest, image)
 
 
-def _centre_lattice(
-    light: NDArray[np.float64], pitch: float, x: float, y: float, n_sub: int
-) -> tuple[float, float]:
-    """Number the lenslets so that the pupil's light is centred on the ``n_sub`` by ``n_sub`` grid."""
+def _find_pupil(
+    image: NDArray[np.float64],
+    light: NDArray[np.float64],
+    pitch: float,
+    origin: tuple[float, float],
+    n_sub: int,
+) -> PupilOutline:
+    """Find the pupil on the lattice with a point at ``origin``."""
     smooth = ndimage.uniform_filter(light, round(pitch))
     # Opening by more than one pitch removes hot pixels, which would extend the outline.
     kernel_size = round(1.5 * pitch) | 1
     opened = ndimage.maximum_filter(ndimage.minimum_filter(smooth, kernel_size, mode="constant"), kernel_size)
-    # By the outline of the pupil, because a Gaussian beam may be off its centre.
-    pupil_area = opened > 0.1 * np.percentile(opened, 99)
-    if not pupil_area.any():
+    lit = opened > 0.1 * np.percentile(opened, 99)
+    if not lit.any():
         raise CalibrationError(
             "single bright pixels but no illuminated pupil on the wavefront sensor; "
             "check source, exposure and sensor.pitch_px"
         )
-    rows, columns = np.nonzero(pupil_area)
-    half = (n_sub - 1) / 2
-
-    def first_centre(at: NDArray[np.intp], phase: float) -> float:
-        middle = 0.5 * float(at.min() + at.max())
-        return phase + pitch * round((middle - phase) / pitch - half)
-
-    return first_centre(columns, x), first_centre(rows, y)
+    rows, columns = np.nonzero(lit)
+    x, y = (
+        (0.5 * float(at.min() + at.max()) - start) / pitch
+        for at, start in zip((columns, rows), origin, strict=True)
+    )
+    return fit_pupil_outline(LensletLight.from_image(image, pitch, origin), n_sub, (x, y))
 
 
 def _build_grid(

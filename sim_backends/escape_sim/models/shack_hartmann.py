@@ -574,6 +574,11 @@ class ShackHartmannModel(DesignModel):
                 out[p] += by_width * shares[p]
         return np.asarray(parts[0] @ modes, dtype=float), out
 
+    @property
+    def numbering_offsets(self) -> tuple[tuple[int, int], tuple[int, int]]:
+        """Competing numberings of the lenslets, see :class:`HasNumberingOffsets`."""
+        return self._grid.numbering_offsets
+
     def variants(self) -> list[ShackHartmannModel]:
         """The model with motion and pokes larger by the motion's uncertainty, see :class:`SyntheticModel`."""
         if self._variants is None:

@@ -182,7 +182,7 @@ class OOPAOShackHartmannModel(OOPAOPushPullModel):
     """
 
     def __init__(self, config: SystemConfig, grid: SubApertureGrid) -> None:
-        pupil = pupil_geometry(config)
+        pupil, self._grid = pupil_geometry(config), grid
         n_sub = pupil.n_sub
         if grid.valid.shape != (n_sub, n_sub):
             raise CalibrationError(f"the grid has {grid.valid.shape} lenslets; sensor.n_sub is {n_sub}")
@@ -199,6 +199,11 @@ class OOPAOShackHartmannModel(OOPAOPushPullModel):
         self._moments = window_moments(
             grid, np.asarray(lit), config.devices.wfs.region[:1:-1], pupil.n_pix, spot_px
         )
+
+    @property
+    def numbering_offsets(self) -> tuple[tuple[int, int], tuple[int, int]]:
+        """Competing numberings of the lenslets, see :class:`HasNumberingOffsets`."""
+        return self._grid.numbering_offsets
 
     def _slopes(self, mirror: Any, paths_m: NDArray[np.float64]) -> NDArray[np.float64]:
         """Spot positions ``(n_slopes, n)`` in camera pixels for mirror shapes ``(n_act, n)``."""
