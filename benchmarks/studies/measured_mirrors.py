@@ -28,6 +28,7 @@ from escape_hw.api.synthetic_model import PROFILE_WIDTHS
 from escape_hw.calibration.sprint.fit import SprintFit
 from escape_hw.calibration.sprint.synthetic_matrix import compute_fitted_matrix
 from escape_hw.calibration.sprint.tip_tilt import TipTiltFreeModel
+from escape_hw.io.provenance import get_git_state
 from escape_hw.report.comparison import changed_gains
 from escape_hw.report.figures import style
 
@@ -109,6 +110,7 @@ def describe(line: dict[str, Any]) -> str:
 
 def measure(folder: Path, target: Path) -> None:
     """Fit all dates, compare successive ones, write and print."""
+    commit = get_git_state()  # before the table, which may be tracked, changes
     target.unlink(missing_ok=True)
     before: tuple[InteractionMatrix, SprintFit, str] | None = None
     for entry in read_entries(folder):
@@ -117,7 +119,7 @@ def measure(folder: Path, target: Path) -> None:
         estimate = fit.estimate
         corrections = estimate.actuator_corrections
         line = {
-            "date": entry["date"], "moves": entry["alive"], "n_valid": entry["n_valid"],
+            "date": entry["date"], "commit": commit, "moves": entry["alive"], "n_valid": entry["n_valid"],
             "converged": estimate.converged, "warnings": list(estimate.warnings),
             "notes": list(estimate.notes), "registration": estimate.registration.to_array().tolist(),
             "sigma": estimate.sigma.tolist(), "repeatability_sigma": between_runs(fit).tolist(),

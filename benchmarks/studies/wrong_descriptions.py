@@ -31,6 +31,7 @@ from escape_hw.config.loader import load_system
 from escape_hw.config.system import SystemConfig
 from escape_hw.errors import EscapeError
 from escape_hw.io.interchange.arrays import design_geometry
+from escape_hw.io.provenance import get_git_state
 from escape_hw.runtime.session.array_target import array_target
 from escape_hw.runtime.session.system import System
 from escape_sim.models.factory import make_fast_model
@@ -165,11 +166,12 @@ def main() -> None:
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
     target = options.out / "wrong-descriptions.jsonl"
+    commit = get_git_state()  # before the table, which may be tracked, changes
     saved = {(row["system"], row["description"]): row for row in read_lines(target)}
     for case in [twin_case()] if options.data is None else [dm97_case(options.data)]:
         truth: NDArray[np.float64] | None = None
         for name, (matrix, overrides, change) in descriptions(case).items():
-            row: dict[str, Any] = {"system": case.name, "description": name}
+            row: dict[str, Any] = {"system": case.name, "description": name, "commit": commit}
             if (case.name, name) in saved:
                 truth = np.array(saved[case.name, name]["registration"]) if truth is None else truth
                 continue

@@ -114,6 +114,15 @@ class Device(abc.ABC):
         if not self._is_open:
             raise NotOpen(self.name, "not open; call open() first, or use it in a 'with' statement")
 
+    @property
+    def applies_twin_section(self) -> bool:
+        """Whether the device is simulated as ``[twin]`` of its system says.
+
+        The registration of such a mirror and such a sensor is ``[twin.registration]``; results are compared
+        with it only then.
+        """
+        return False
+
     def now_ns(self) -> int:
         """Monotonic clock of the device in nanoseconds; the clock of a twin is simulated."""
         return time.monotonic_ns()

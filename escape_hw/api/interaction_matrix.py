@@ -57,6 +57,8 @@ class InteractionMatrix:
         Scalars of the measurement (frames, poke, delay, lost frames, ...).
     slope_unit
         Unit of the slopes.
+    layout
+        Layout of the actuators it is of, as in ``devices.dm.layout``; empty if unknown.
     """
 
     data: NDArray[np.float32]
@@ -68,6 +70,7 @@ class InteractionMatrix:
     simulated: bool
     metrics: dict[str, Any] = field(default_factory=dict)
     slope_unit: str = "pixel"
+    layout: str = ""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "metrics", _Metrics(self.metrics))

@@ -37,7 +37,7 @@ class Registration:
     shift_x, shift_y
         In % of a sub-aperture.
     rotation
-        In degrees.
+        In degrees; stored in (-180, 180], whatever multiple of 360 a fit or a caller adds.
     radial_scaling, tangential_scaling
         Scaling along x and along y, in % (OOPAO's names).
     anamorphosis_angle
@@ -52,6 +52,11 @@ class Registration:
     radial_scaling: float = 0.0
     tangential_scaling: float = 0.0
     anamorphosis_angle: float = 0.0
+
+    def __post_init__(self) -> None:
+        # Values within the range stay as they are, to the last bit.
+        if not -180 < self.rotation <= 180:
+            object.__setattr__(self, "rotation", 180 - (180 - self.rotation) % 360)
 
     @classmethod
     def from_array(cls, values: ArrayLike) -> Registration:

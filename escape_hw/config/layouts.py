@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from escape_hw.bounded_files import MAX_TEXT_BYTES, read_bounded
+from escape_hw.errors import IncompatibleProduct
 
 if TYPE_CHECKING:
     import numpy as np
@@ -280,6 +281,39 @@ def grid_positions(grid: NDArray[np.bool_]) -> NDArray[np.float64]:
 
     rows, columns = np.nonzero(grid)
     return np.stack([columns, rows], axis=1) - (np.array(grid.shape[::-1]) - 1) / 2
+
+
+def require_same_positions(measured: str, present: str, subject: str) -> None:
+    """Refuse a matrix of actuators at other positions than those of the mirror in use.
+
+    Positions are compared up to their unit, so that a corrected pitch does not matter.
+
+    Parameters
+    ----------
+    measured, present
+        Layout of the matrix, accepted if it is empty or of no known form, and ``devices.dm.layout``.
+    subject
+        What the message begins with.
+
+    Raises
+    ------
+    IncompatibleProduct
+        The positions differ.
+    """
+    import numpy as np
+
+    if not measured or measured == present:
+        return
+    try:
+        theirs = positions(measured)
+    except ValueError:
+        return
+    ours = positions(present)
+    if theirs.shape != ours.shape or not np.allclose(theirs / theirs.std(), ours / ours.std(), atol=1e-6):
+        raise IncompatibleProduct(
+            f"{subject} was measured with the layout {shorten(measured)!r} of {len(theirs)} actuators; "
+            f"devices.dm.layout is {shorten(present)!r}, with other positions: measure the matrix again"
+        )
 
 
 def shorten(layout: str) -> str:

@@ -70,7 +70,9 @@ def reproduce_shwfs(
     """Calibrate a bench with and without a source, and close the loop with every matrix.
 
     The push-pull baseline and the model PSF are measured without the phase screen; the DO-CRIME and
-    ESCAPE calibrations and all loops under turbulence. No step reads the true state of a simulation.
+    ESCAPE calibrations and all loops under turbulence. All share the sensor geometry and the slope references
+    measured under turbulence, so that the loops differ in the matrix only. No step reads the true state of a
+    simulation.
 
     Parameters
     ----------
@@ -160,7 +162,7 @@ def reproduce_pywfs(
     CalibrationError
         No gain gives a stable loop.
     """
-    measure = partial(measure_matrices, bench, frames, common_geometry=True)
+    measure = partial(measure_matrices, bench, frames)
     evaluate = partial(_gains_and_loops, bench, closed_frames, loop_frames)
     return (yield from _compare(bench, frames, measure, evaluate))
 
@@ -210,7 +212,7 @@ def reproduce_revolt(
     CalibrationError
         No gain gives a stable loop.
     """
-    measure = partial(measure_matrices, bench, frames, common_geometry=True)
+    measure = partial(measure_matrices, bench, frames)
     return (yield from _compare(bench, frames, measure, partial(_close_loops, bench, loop_frames)))
 
 

@@ -147,11 +147,33 @@ def test_a_reproduction_saves_the_finished_parts(good):
 
 
 @pytest.mark.slow
+def test_stopped_in_push_pull_a_reproduction_keeps_the_other_matrices(good):
+    stop = StopThere("push-pull", 0.0)
+    with small() as bench, pytest.raises(Aborted) as caught:
+        bench.run(reproduce_shwfs(bench, frames=400), observers=(stop,), abort=stop.abort)
+    calibrations = caught.value.partial.calibrations
+    assert list(calibrations)[-2:] == ["DO-CRIME", "ESCAPE"]
+    assert not calibrations["ESCAPE"].partial
+
+
+@pytest.mark.slow
+def test_all_matrices_of_a_reproduction_share_lenslets_and_references(good):
+    stop = StopThere("model PSF", 0.0)
+    with small() as bench, pytest.raises(Aborted) as caught:
+        bench.run(reproduce_shwfs(bench, frames=400), observers=(stop,), abort=stop.abort)
+    ours, *others = (one.grid for one in caught.value.partial.calibrations.values())
+    assert len(others) == 2
+    for other in others:
+        np.testing.assert_array_equal(other.references_px, ours.references_px)
+        assert (other.origin_px, other.pitch_px) == (ours.origin_px, ours.pitch_px)
+
+
+@pytest.mark.slow
 def test_stopped_before_sprint_a_reproduction_keeps_no_escape_matrix(good):
     stop = StopThere("DO-CRIME", 0.01)
     with small() as bench, pytest.raises(Aborted) as caught:
         bench.run(reproduce_shwfs(bench, frames=50_000), observers=(stop,), abort=stop.abort)
-    assert list(caught.value.partial.calibrations) == ["push-pull", "DO-CRIME"]
+    assert list(caught.value.partial.calibrations) == ["DO-CRIME"]
     assert caught.value.partial.calibrations["DO-CRIME"].partial
 
 

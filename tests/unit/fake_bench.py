@@ -32,8 +32,9 @@ class FakeBench:
         self.config = config
         self.simulated = config.system.mode == "sim"
         info = SimpleNamespace(serial="SIM97", layout=fake.layout())
-        self.dm = SimpleNamespace(info=info)
-        self.wfs = self.science = SimpleNamespace(info=SimpleNamespace(serial="SIMCAM"))
+        self.dm = SimpleNamespace(info=info, applies_twin_section=self.simulated)
+        camera = SimpleNamespace(serial="SIMCAM")
+        self.wfs = self.science = SimpleNamespace(info=camera, applies_twin_section=self.simulated)
         self.screen, self.modulator = FakeScreen(), None
         self.closed = False
         self.screen_seen: dict[str, bool] = {}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 
+import fake_bench
 import pytest
 
 from escape_hw.io.fits.loop import load_loop
@@ -41,6 +42,21 @@ def test_reproduce_judges_its_own_result(document, bench, tmp_path):
     failed = [check["text"] for check in found["criteria"] if not check["met"]]
     assert len(failed) == 1
     assert "injected registration" in failed[0]
+
+
+def test_a_foreign_simulation_is_not_judged_by_the_twin_section(document, bench, monkeypatch, tmp_path):
+    opened = fake_bench.FakeBench.__enter__
+
+    def enter(self):
+        self.dm.applies_twin_section = False
+        return opened(self)
+
+    monkeypatch.setattr(fake_bench.FakeBench, "__enter__", enter)
+    words = ("reproduce", "shwfs", "--out", tmp_path / "run", "--realisations", 0)
+    code, found, _ = document(*words, "--set", "twin.registration.shift_x=30")
+    assert code == 0
+    assert found["injected"] is None
+    assert not [check for check in found["criteria"] if "injected" in check["text"]]
 
 
 @pytest.mark.usefixtures("reports")

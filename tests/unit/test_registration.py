@@ -86,3 +86,21 @@ def test_the_anamorphosis_angle_turns_the_scalings_from_y_towards_x() -> None:
     assert turned.to_dict()["anamorphosis_angle"] == 45.0
     assert Registration(**turned.to_dict()) == turned
     assert turned.to_array().size == 5
+
+
+@pytest.mark.parametrize(
+    ("given", "stored"),
+    [(180.0, 180.0), (-180.0, 180.0), (180.5, -179.5), (348.0, -12.0), (-348.0, 12.0), (720.25, 0.25)],
+)
+def test_rotations_are_stored_between_minus_and_plus_180_degrees(given: float, stored: float) -> None:
+    turned = Registration(rotation=given)
+    assert turned.rotation == pytest.approx(stored)
+    assert Registration.from_array(turned.to_array()) == turned
+    assert Registration.from_array([0, 0, given, 0, 0]) == turned
+    np.testing.assert_allclose(placed(EAST, rotation=given), placed(EAST, rotation=stored), atol=1e-12)
+
+
+def test_a_rotation_within_the_range_keeps_its_last_bit() -> None:
+    value = float(np.nextafter(-0.743, 0))
+    assert Registration(rotation=value).rotation == value
+    assert np.isnan(Registration(rotation=np.nan).rotation)

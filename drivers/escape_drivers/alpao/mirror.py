@@ -300,6 +300,11 @@ class AlpaoMirror(DeformableMirror):
             raise DeviceError(self.name, "is not connected; call open() first")
         return self._library, self._handle
 
+    @property
+    def applies_twin_section(self) -> bool:
+        """True with the stand-in of the SDK, behind which is the simulated bench."""
+        return self._info is not None and self._info.simulated
+
     def _build_info(self, model: str, stand_in: bool) -> DMInfo:
         named = f"{model} (stand-in)" if stand_in else model
         return mirror_info(

@@ -120,6 +120,7 @@ class AravisCamera(BlockingCamera[AravisLibrary]):
         library.call("camera_set_region", 0, 0, width, height)
         self._limits = _read_limits(library)
         self._info = self._build_info(model, library.stand_in or self._options.interface == "Fake")
+        self._is_stand_in = library.stand_in
         log.info("%s: %s, serial number %s", self.name, model, self._setup.serial)
         self._settings = self._apply_settings(self._check(self._setup.settings((width, height))))
 

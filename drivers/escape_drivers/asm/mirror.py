@@ -190,6 +190,7 @@ class AsmMirror(AdaptiveSecondary):
         super().__init__(name, limits or CAUTIOUS_LIMITS, lift=self._options.lift)
         self._expected = ExpectedMirror(require_serial("serial", serial), layout, pitch_m, stroke_m, limits)
         self._make_codec, self._emulator = make_codec, emulator
+        self._is_on_twin = emulator is not None
         if emulator is None and self._options.host == EMULATOR:
             self._emulator = emulator_factory("asm")(EmulatorRequest(port=0))
         self._link = self._make_link(m.Role.CONTROL)
@@ -221,6 +222,11 @@ class AsmMirror(AdaptiveSecondary):
         if self._info is None:
             raise NotOpen(self.name, "its number of actuators is known once it is open; call open() first")
         return self._info
+
+    @property
+    def applies_twin_section(self) -> bool:
+        """True with the emulator of the same process, whose actuators are those of the simulated bench."""
+        return self._is_on_twin
 
     def parameter(self, key: str) -> float:
         """One of the mirror's own parameters, such as ``telemetry_hz``; ``DeviceError`` if it has none."""

@@ -160,7 +160,7 @@ class BlockingCamera(Camera, Generic[C]):
         self._setup, self._kind = setup, kind
         self._sensor_px = setup.sensor_px
         self._settings = setup.settings(self._sensor_px)
-        self._info = self._build_info(kind, stand_in=False)
+        self._info, self._is_stand_in = self._build_info(kind, stand_in=False), False
         self._full_scale = np.uint16(self._info.full_scale)
         self._saturation_mask = np.empty((0, 0), np.bool_)
         self._connection: C | None = None
@@ -210,6 +210,11 @@ class BlockingCamera(Camera, Generic[C]):
         if self._connection is None:
             raise NotOpen(self.name, "is not connected; call open() first")
         return self._connection
+
+    @property
+    def applies_twin_section(self) -> bool:
+        """True with the stand-in of a vendor library, behind which is the simulated bench."""
+        return self._is_stand_in
 
     def _build_info(self, model: str, stand_in: bool) -> CameraInfo:
         setup = self._setup

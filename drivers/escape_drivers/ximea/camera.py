@@ -172,6 +172,7 @@ class XimeaCamera(BlockingCamera[XimeaLibrary]):
         )
         log.info("%s: %s %s, xiAPI %s", self.name, model, serial, version)
         self._info = self._build_info(f"XIMEA {model}", library.stand_in)
+        self._is_stand_in = library.stand_in
         self._get_image = library.c.xiGetImage
         self._settings = self._apply_settings(self._check(self._setup.settings(sensor)))
 

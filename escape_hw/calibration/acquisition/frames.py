@@ -120,4 +120,5 @@ def build_interaction_matrix(
         bench.simulated,
         dict(metrics),
         grid.slope_unit,
+        bench.config.devices.dm.layout,
     )

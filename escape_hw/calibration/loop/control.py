@@ -16,6 +16,7 @@ from escape_hw.api.results import CalibrationResult
 from escape_hw.api.sensor import SensorGeometry, SlopeFunction
 from escape_hw.bench import Bench
 from escape_hw.calibration.acquisition.sensor_setup import build_slope_function
+from escape_hw.config import layouts
 from escape_hw.errors import ConfigError, IncompatibleProduct
 from escape_hw.pipeline.control.integrator import LeakyIntegrator
 from escape_hw.pipeline.control.reconstructor import reconstructor
@@ -62,6 +63,7 @@ def build_integrator(
             f"the matrix is for {matrix.m2c.shape[0]} actuators and {matrix.n_slopes} slopes; "
             f"this bench has {bench.dm.info.n_act} and {grid.n_slopes}"
         )
+    layouts.require_same_positions(matrix.layout, bench.config.devices.dm.layout, "the matrix")
     if not np.array_equal(matrix.valid, grid.valid):
         raise IncompatibleProduct(f"the matrix and the geometry mark different {grid.elements} as valid")
     dropped = c.dropped_modes if dropped_modes is None else dropped_modes

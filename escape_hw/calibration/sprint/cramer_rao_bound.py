@@ -32,7 +32,7 @@ class CramerRaoBound:
     exact
         For an exact model: gain and registration are the only unknowns.
     hybrid
-        With the random effects and the systematic error of the model.
+        With the random effects as further unknowns of known scatter.
     """
 
     exact: NDArray[np.float64]

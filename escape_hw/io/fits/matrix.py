@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -169,6 +170,7 @@ def _unpack_matrix(
         simulated=bool(header["SIMULATE"]),
         metrics=extensions.unpack_metrics(path, hdus, f"{prefix}METRICS"),
         slope_unit=str(cards["BUNIT"]),
+        layout=_read_layout(path, hdus),
     )
     # A single measurement of each element has no standard error; it is NaN.
     known_sigma = matrix.sigma[~np.isnan(matrix.sigma)]
@@ -176,6 +178,14 @@ def _unpack_matrix(
         fits_file.require_values(path, f"{prefix}{name}", values, low, _LARGEST)
     fits_file.require_values(path, "M2C", matrix.m2c, -_LARGEST, _LARGEST)
     return matrix
+
+
+def _read_layout(path: Path, hdus: astropy_fits.HDUList) -> str:
+    """Layout of the actuators in the stored configuration; empty if there is none."""
+    try:
+        return str(tomllib.loads(fits_file.read_text(path, hdus, "CONFIG"))["devices"]["dm"]["layout"])
+    except (KeyError, TypeError, ValueError):
+        return ""
 
 
 def _unpack(path: Path, hdus: astropy_fits.HDUList, header: dict[str, Any]) -> CalibrationResult:

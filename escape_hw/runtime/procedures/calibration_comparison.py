@@ -45,33 +45,25 @@ class CalibrationComparison:
     __repr__ = short_repr
 
 
-def measure_matrices(
-    bench: Bench, frames: int, result: CalibrationComparison, *, common_geometry: bool = False
-) -> Procedure[None]:
+def measure_matrices(bench: Bench, frames: int, result: CalibrationComparison) -> Procedure[None]:
     """Add the calibrations "push-pull", "DO-CRIME" and "ESCAPE", the latter two from the same ``frames``.
 
-    With ``common_geometry``, push-pull is measured last, with the sensor geometry of ESCAPE, so that the
-    matrices differ in nothing else; otherwise first, with a geometry of its own. ``result.partial`` is set
-    when one of them was stopped.
+    Push-pull is measured last, with the sensor geometry and slope references of ESCAPE, so that the matrices
+    differ in nothing else. ``result.partial`` is set when one of them was stopped.
     """
-    if not common_geometry:
-        baseline = yield from calibrate_with_method(bench, "push-pull")
-        result.calibrations["push-pull"], result.partial = baseline, baseline.partial
-        if result.partial:
-            return
     found = yield from calibrate_with_method(bench, "escape", frames=frames)
     result.partial = found.partial
     if found.partial:
         # Stopped before SPRINT: only the DO-CRIME matrix exists.
         result.calibrations["DO-CRIME"] = found
         return
-    if common_geometry:
-        baseline = yield from calibrate_with_method(bench, "push-pull", grid=found.grid)
-        result.calibrations["push-pull"], result.partial = baseline, baseline.partial
     measured = measured_calibration(found)
     if measured is not None:
         result.calibrations["DO-CRIME"] = measured
     result.calibrations["ESCAPE"] = found
+    baseline = yield from calibrate_with_method(bench, "push-pull", grid=found.grid)
+    # Tables begin with the baseline.
+    result.calibrations, result.partial = {"push-pull": baseline, **result.calibrations}, baseline.partial
 
 
 def measure_optical_gains(

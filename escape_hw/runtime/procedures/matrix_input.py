@@ -31,6 +31,7 @@ def load_fitting_matrix(im: Path, config: SystemConfig, simulated: bool = False)
     ProductError, IncompatibleProduct
         The file is damaged or belongs to another system.
     """
+    from escape_hw.config import layouts
     from escape_hw.io.fits.matrix import load_matrix
 
     product = load_matrix(
@@ -42,41 +43,8 @@ def load_fitting_matrix(im: Path, config: SystemConfig, simulated: bool = False)
         expect_actuators=config.devices.dm.n_act,
         allow_simulated=simulated or config.system.mode == "sim",
     )
-    require_same_actuators(product, config)
+    layouts.require_same_positions(product.matrix.layout, config.devices.dm.layout, f"{product.path}:")
     return product
-
-
-def require_same_actuators(product: MatrixProduct, config: SystemConfig) -> None:
-    """Refuse a matrix that was measured with actuators at other positions.
-
-    Positions are compared up to their unit, so that a corrected pitch does not matter. A product without a
-    configuration is accepted.
-
-    Raises
-    ------
-    IncompatibleProduct
-        The layout of the product's configuration has other positions.
-    """
-    import tomllib
-
-    import numpy as np
-
-    from escape_hw.config import layouts
-
-    try:
-        found = tomllib.loads(product.config_text)["devices"]["dm"]["layout"]
-        theirs = layouts.positions(found)
-    except (KeyError, TypeError, ValueError):
-        return
-    ours = layouts.positions(config.devices.dm.layout)
-    if found == config.devices.dm.layout:
-        return
-    if theirs.shape != ours.shape or not np.allclose(theirs / theirs.std(), ours / ours.std(), atol=1e-6):
-        raise IncompatibleProduct(
-            f"{product.path}: was measured with the layout {layouts.shorten(found)!r} of {len(theirs)} "
-            f"actuators; devices.dm.layout is {layouts.shorten(config.devices.dm.layout)!r}, with other "
-            "positions: measure the matrix again"
-        )
 
 
 def require_hardware_matrix(product: MatrixProduct, bench: Bench, force: bool) -> None:

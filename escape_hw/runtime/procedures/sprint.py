@@ -57,6 +57,7 @@ class SprintProcedure(ComputedProcedure["CalibrationResult"], SprintParameters["
 
     def load(self, config: SystemConfig, simulated: bool = False) -> None:
         """Read the matrix; number of modes, basis and mode may differ from the configuration."""
+        from escape_hw.config import layouts
         from escape_hw.io.fits.matrix import load_matrix
 
         self._config = config
@@ -66,6 +67,9 @@ class SprintProcedure(ComputedProcedure["CalibrationResult"], SprintParameters["
             expect_sensor=config.sensor.kind,
             expect_actuators=config.devices.dm.n_act,
             expect_sub_apertures=(config.sensor.n_sub, config.sensor.n_sub),
+        )
+        layouts.require_same_positions(
+            self._product.matrix.layout, config.devices.dm.layout, f"{self._product.path}:"
         )
 
     def compute(self) -> Procedure[CalibrationResult]:

@@ -90,7 +90,7 @@ class TrackProcedure(MatrixProcedure["TrackResult"]):
         if result.latest is not None:
             add_result(folder, record, "im", result.latest, self.product.path)
         track = track_document(result)
-        injected = injected_registration(self._config) if record.simulated else None
+        injected = injected_registration(self._config) if record.applies_twin_section else None
         began, end = result.start_ns * 1e-9, result.rows["seconds"][-1:]
         document = save_run(
             folder, record, "track", f"Tracking {record.system}", wall_seconds,
@@ -100,7 +100,7 @@ class TrackProcedure(MatrixProcedure["TrackResult"]):
             else injected.trajectory(began, track["track"]["seconds"]),
             # True values at the end of the track, for comparison with its last registration.
             injected_end=None if injected is None or not end else injected.at(began + end[0]).to_dict(),
-            injected_note=INJECTED_UNKNOWN if record.simulated and injected is None else "",
+            injected_note=INJECTED_UNKNOWN if record.applies_twin_section and injected is None else "",
             im=self.product.path.absolute(),
             criteria=[
                 {"text": "loop stable", "met": result.stable},

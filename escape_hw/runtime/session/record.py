@@ -19,7 +19,8 @@ from escape_hw.io.provenance import Provenance, format_utc, get_git_state, get_s
 class BenchRecord:
     """Identity of an opened bench, kept after it is closed.
 
-    ``injected`` is the true registration of a simulated mirror, for reports only: no estimator reads it.
+    ``applies_twin_section`` is true if mirror and sensor are simulated as ``[twin]`` says, unlike those of a
+    foreign simulation. ``injected`` is the true registration, for reports only: no estimator reads it.
     ``request`` holds the options of a run that can be resumed.
     """
 
@@ -32,6 +33,7 @@ class BenchRecord:
     layout: tuple[str, ...]
     places_m: tuple[tuple[float, float], ...]
     psf_px: float | None
+    applies_twin_section: bool
     injected: Registration | None
     started: datetime = field(default_factory=lambda: datetime.now(UTC))
     request: Mapping[str, Any] | None = None
@@ -41,13 +43,13 @@ class BenchRecord:
         """Take it from an open bench."""
         config = bench.config
         devices = {"dm": bench.dm, "wfs": bench.wfs, "modulator": bench.modulator, "science": bench.science}
-        simulated = bool(bench.simulated)
         science = config.devices.science
+        is_twin = bench.dm.applies_twin_section and bench.wfs.applies_twin_section
         # A drifting registration has no single true value.
-        is_static = simulated and not config.twin.drift.is_drifting
+        is_known = is_twin and not config.twin.drift.is_drifting
         return cls(
             system=config.system.name,
-            simulated=simulated,
+            simulated=bool(bench.simulated),
             seed=config.system.seed,
             config_text=config.to_toml(),
             basis=config.basis.kind,
@@ -55,7 +57,8 @@ class BenchRecord:
             layout=actuator_layout(bench),
             places_m=actuator_positions(bench),
             psf_px=None if science is None else float(science.psf_px),
-            injected=config.twin.registration.to_registration() if is_static else None,
+            applies_twin_section=is_twin,
+            injected=config.twin.registration.to_registration() if is_known else None,
         )
 
     def origin(self, parents: Mapping[str, str] | None = None) -> Provenance:

@@ -17,6 +17,7 @@ from escape_hw.api.results import CalibrationResult, LoopResult, RegistrationEst
 from escape_hw.api.sensor import SensorGeometry, SlopeFunction
 from escape_hw.api.tracking import TrackResult
 from escape_hw.bench import Bench
+from escape_hw.config import layouts
 from escape_hw.config.loader import load_system
 from escape_hw.runtime.procedures.calibration import DocrimeProcedure, EscapeProcedure
 from escape_hw.runtime.procedures.declaration import ProcedureSpec
@@ -455,6 +456,7 @@ class System(Bench):
             found = as_calibration(matrix)
             matrix, grid = found.measured or found.matrix, found.grid if grid is None else grid
         matrix, grid = as_matrix_and_grid(matrix, grid)
+        layouts.require_same_positions(matrix.layout, self.config.devices.dm.layout, "the matrix")
         settings = self.config.calibration
         modes = min(settings.sprint_modes, matrix.n_modes)
         return sprint(

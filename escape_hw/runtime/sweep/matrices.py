@@ -38,7 +38,7 @@ def measure_variants(bench: Bench, *, frames: int, gain_frames: int = 0) -> Proc
         As :func:`~escape_hw.runtime.procedures.calibration.calibrate_with_method`.
     """
     result = CalibrationComparison()
-    yield from measure_matrices(bench, frames, result, common_geometry=bool(gain_frames))
+    yield from measure_matrices(bench, frames, result)
     if gain_frames and not result.partial:
         yield from measure_optical_gains(bench, gain_frames, result, accuracy=0.03)
     return result

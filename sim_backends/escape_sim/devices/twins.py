@@ -64,6 +64,11 @@ class _Simulated(Generic[Info]):
         """The simulated bench with its true state; for tests and benchmarks only."""
         return self._bench
 
+    @property
+    def applies_twin_section(self) -> bool:
+        """True: the simulated bench has the state that ``[twin]`` describes."""
+        return True
+
     def now_ns(self) -> int:
         """Simulated time in nanoseconds."""
         return self._bench.now_ns
