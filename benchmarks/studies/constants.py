@@ -23,15 +23,22 @@ from realisation_tables import Line, each_realisation, realisation_numbers, stud
 from escape_hw.api.results import RegistrationEstimate
 from escape_hw.calibration.docrime.open_loop import docrime_run
 from escape_hw.calibration.sprint.fit import sprint, sprint_options_from_config
-from escape_hw.calibration.sprint.normal_equations import Priors
 from escape_hw.calibration.sprint.telemetry_fit import decorrelate_columns
+from escape_hw.config.loader import load_text
+from escape_hw.config.registry import model_factory
+from escape_hw.config.system import SystemConfig
 from escape_hw.io.provenance import get_git_state
 from escape_hw.paper.sky_time import realisation_config
 from escape_hw.runtime.session.system import System
 
 FACTORS = (0.5, 2.0)
-#: Prior scatter with which a fit begins; all but the last are then estimated from the data.
+#: Keys of the configuration, by kind of sensor: prior scatter with which a fit begins, all but that of the
+#: common width then being estimated from the data, and uncertainties of the sensor.
 PRIORS = ("actuator_gain", "actuator_width", "actuator_position", "slope_gain", "sampling", "width")
+SENSOR_KEYS = {
+    "shack-hartmann": ("motion_sigma",),
+    "pyramid": ("turbulence_sigma", "ellipticity_sigma", "image_position_sigma_px", "gain_trend"),
+}
 _SHAPE = "escape_hw.calibration.sprint.influence_shape"
 _EFFECTS = "escape_hw.calibration.sprint.mixed_effects"
 _LENSLETS, _PYRAMID = "escape_sim.models.shack_hartmann", "escape_sim.models.pyramid"
@@ -43,13 +50,9 @@ CONSTANTS = {
         (_SHAPE, "_EDGE_WIDTH_SIGMA"), (_SHAPE, "_EDGE_PROFILE_SIGMA"), (_SHAPE, "_EDGE_ASYMMETRY_SIGMA"),
         (_EFFECTS, "_PSEUDO_COUNT"), (_EFFECTS, "_MIN_PRIOR_RATIO"),
     ),
-    "shack-hartmann": (
-        (_LENSLETS, "_MOTION_UNCERTAINTY"), (_LENSLETS, "_TILT_VARIANCE"), (_LENSLETS, "_OUTER_SCALE"),
-    ),
+    "shack-hartmann": ((_LENSLETS, "_TILT_VARIANCE"), (_LENSLETS, "_OUTER_SCALE")),
     "pyramid": (
-        (_PYRAMID, "_SCALING_SYSTEMATIC"), (_PYRAMID, "_GAIN_TREND"), (_PYRAMID, "_STRENGTH_UNCERTAINTY"),
-        (_PYRAMID, "_ELLIPSE"), (_PYRAMID, "_IMAGE_POSITION_ERROR_PX"), (_PYRAMID, "_OUTER_SCALE"),
-        (_TURBULENCE, "_RMS_ERROR"), (_TURBULENCE, "_PERSISTENCE_ERROR"),
+        (_PYRAMID, "_OUTER_SCALE"), (_TURBULENCE, "_RMS_ERROR"), (_TURBULENCE, "_PERSISTENCE_ERROR"),
     ),
 }  # fmt: skip
 
@@ -66,6 +69,18 @@ def scaled(module: str, name: str, factor: float) -> Iterator[None]:
         setattr(owner, name, value)
 
 
+def with_key(config: SystemConfig, key: str, factor: float) -> SystemConfig:
+    """The configuration with one of its numbers multiplied by a factor."""
+    section, name = key.rsplit(".", 1)
+    value: Any = config
+    for part in section.split("."):
+        value = getattr(value, part)
+    return load_text(
+        config.to_toml(), config.system.name, overrides=[f"{key}={factor * getattr(value, name)!r}"],
+        seed=config.system.seed, mode="sim",
+    )  # fmt: skip
+
+
 def run_realisation(system: str, number: int, frames: int) -> Line:
     """Fits of one measurement with all constants as they are, and with each of them scaled."""
     injected, config = realisation_config(system, number)
@@ -73,19 +88,20 @@ def run_realisation(system: str, number: int, frames: int) -> Line:
         run = bench.run(docrime_run(bench, frames=frames))
         solution, grid = run.solution, run.result.grid
         matrix = decorrelate_columns(run.result.matrix, solution.gram, solution.variance)
-        options = sprint_options_from_config(config.calibration)
 
-        def fit(**priors: float) -> RegistrationEstimate:
-            return sprint(
-                matrix, bench.model(grid), covariance=solution.covariance, priors=Priors(**priors), **options
-            )
+        def fit(settings: SystemConfig = config) -> RegistrationEstimate:
+            model = model_factory(settings.calibration.model)(settings, grid)
+            options = sprint_options_from_config(settings.calibration)
+            return sprint(matrix, model, covariance=solution.covariance, **options)
 
         row: Line = {"commit": get_git_state(), "seed": config.system.seed, "fits": {}}
         row["base"] = _numbers(fit(), injected.to_array())
+        keys = [f"calibration.priors.{name}" for name in PRIORS]
+        keys += [f"sensor.{name}" for name in SENSOR_KEYS[config.sensor.kind]]
         for factor in FACTORS:
-            for name in PRIORS:
-                changed = fit(**{name: factor * getattr(Priors(), name)})
-                row["fits"][f"Priors.{name} x {factor:g}"] = _numbers(changed, injected.to_array())
+            for key in keys:
+                changed = fit(with_key(config, key, factor))
+                row["fits"][f"{key} x {factor:g}"] = _numbers(changed, injected.to_array())
             for module, name in CONSTANTS["any"] + CONSTANTS[config.sensor.kind]:
                 with scaled(module, name, factor):
                     changed = fit()

@@ -46,6 +46,11 @@ class ShackHartmannSection(SensorSection):
     threshold: float = Field(
         0.02, ge=0, le=0.9, description="centre-of-gravity threshold above background, fraction of full scale"
     )
+    motion_sigma: float = Field(
+        0.25, gt=0, le=2,
+        description="SPRINT: relative uncertainty of the spots' motion; blur within the lenslets counts as "
+        "motion, too",
+    )  # fmt: skip
     valid: LayoutText | None = Field(
         None,
         description="valid sub-apertures on the grid of n_sub x n_sub: 'circle-N', 'square-N', "
@@ -83,6 +88,24 @@ class PyramidSection(SensorSection):
         description="slopes are divided by the mean flux of all pixels ('global') "
         "or by the flux of each pixel ('local')",
     )
+    turbulence_sigma: float = Field(
+        0.4, gt=0, le=2,
+        description="SPRINT: relative uncertainty of the turbulence strength, found from the slopes' motion",
+    )  # fmt: skip
+    ellipticity_sigma: float = Field(
+        0.05,
+        gt=0,
+        le=1,
+        description="SPRINT: relative ellipticity of the modulation, rms along each direction",
+    )
+    image_position_sigma_px: float = Field(
+        0.1, gt=0, le=10, description="SPRINT: uncertainty of the pupil images' relative positions, pixels"
+    )
+    gain_trend: float = Field(
+        0.3, gt=0, le=2,
+        description="SPRINT: relative change of the slopes' gain towards the rim: under turbulence and pokes "
+        "the response there is known approximately",
+    )  # fmt: skip
 
     @model_validator(mode="after")
     def _rules(self) -> Self:

@@ -165,6 +165,34 @@ class LoopSection(Section):
     )
 
 
+class PriorsSection(Section):
+    """Differences of real instruments from their model: rms among instruments of a kind.
+
+    SPRINT fits them beside the registration and begins with these; all but that of the common width are then
+    estimated from the data, between 0.05 and 3 times the value here.
+    """
+
+    actuator_gain: float = Field(
+        0.1, gt=0, le=2, description="gains of single actuators, relative; ALPAO DM97: 0.06 to 0.09 measured"
+    )
+    actuator_width: float = Field(
+        0.05, gt=0, le=1, description="widths of single influence functions, relative; ALPAO DM97: 0.02"
+    )
+    actuator_position: float = Field(
+        5.0, gt=0, le=100, description="positions of single actuators along each axis, % of a sub-aperture"
+    )
+    slope_gain: float = Field(
+        0.1, gt=0, le=2, description="gains of single slopes, relative: uneven light, spot size, pixels"
+    )
+    sampling: float = Field(
+        0.5, gt=0, le=50,
+        description="position of a lenslet within its column or row of pixels, % of a sub-aperture",
+    )  # fmt: skip
+    width: float = Field(
+        0.2, gt=0, le=1, description="common width of the influence functions, relative to the nominal one"
+    )
+
+
 class CalibrationSection(Section):
     """Defaults of the calibration procedures."""
 
@@ -227,6 +255,9 @@ class CalibrationSection(Section):
     learning_rate: float = Field(1.0, gt=0, le=1, description="SPRINT: fraction of each Gauss-Newton step")
     model: str = Field(
         "fast", min_length=1, description="SPRINT: synthetic model (entry point in escape.models)"
+    )
+    priors: PriorsSection = Field(
+        default_factory=PriorsSection, description="SPRINT: expected differences of the system from its model"
     )
 
 

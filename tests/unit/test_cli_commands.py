@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import fake_results as fake
 
+from escape_hw.calibration.sprint.normal_equations import Priors
 from escape_hw.io.fits.loop import load_loop
 from escape_hw.io.fits.matrix import load_matrix
 
@@ -112,6 +113,7 @@ def test_sprint_uses_the_measured_matrix_and_opens_nothing(document, bench, im, 
         "loss": "squares",
         "actuator_model": "fitted",
         "extra_parameters": (),
+        "usual_priors": Priors(),
     }
     assert bench.calls == [("sprint", asked)]
     assert (

@@ -69,6 +69,8 @@ _RENAMED_CAPABILITIES = {
 _TIP_TILT_NOTE = "the slopes of the matrix have no tip and tilt; those of the model were removed as well"
 #: Signal-to-noise ratio of the best mode below which a matrix is refused.
 _MIN_SNR = 0.1
+#: Differences of real instruments from their model where no configuration gives them.
+_USUAL_PRIORS = Priors()
 
 
 class SprintOptions(TypedDict):
@@ -80,6 +82,7 @@ class SprintOptions(TypedDict):
     actuator_model: ActuatorModel
     learning_rate: float
     extra_parameters: tuple[ExtraParameter, ...]
+    usual_priors: Priors
 
 
 def sprint_options_from_config(section: CalibrationSection) -> SprintOptions:
@@ -91,6 +94,7 @@ def sprint_options_from_config(section: CalibrationSection) -> SprintOptions:
         "actuator_model": section.actuator_model,
         "learning_rate": section.learning_rate,
         "extra_parameters": section.extra_parameters,
+        "usual_priors": Priors(**section.priors.model_dump()),
     }
 
 
@@ -134,6 +138,7 @@ def sprint(
     max_iterations: int = 40,
     covariance: NDArray[np.float64] | None = None,
     priors: Priors | None = None,
+    usual_priors: Priors = _USUAL_PRIORS,
     update_priors: bool = True,
     coarse_search: bool = True,
     extra_parameters: Sequence[ExtraParameter] = (),
@@ -172,7 +177,9 @@ def sprint(
         Turbulence correlates neighbouring slopes, which enlarges the errors of the registration. Without it
         the correlation is estimated, less precisely, from the scatter between modes.
     priors
-        Prior scatter of the random effects.
+        Prior scatter of the random effects; ``usual_priors`` by default.
+    usual_priors
+        Their scatter among instruments of a kind. Estimates of the scatter are limited relative to it.
     update_priors
         Estimate that scatter from the data and solve again with it.
     coarse_search
@@ -207,7 +214,7 @@ def sprint(
     steps = fit_registration(
         matrix, model, modes=modes, modes_choice=modes_choice, solver=solver, loss=loss,
         learning_rate=learning_rate, start=start, max_iterations=max_iterations, covariance=covariance,
-        priors=priors, update_priors=update_priors, coarse_search=coarse_search,
+        priors=priors, usual_priors=usual_priors, update_priors=update_priors, coarse_search=coarse_search,
         extra_parameters=extra_parameters, actuator_model=actuator_model,
     )  # fmt: skip
     while True:
@@ -231,6 +238,7 @@ def fit_registration(
     max_iterations: int = 40,
     covariance: NDArray[np.float64] | None = None,
     priors: Priors | None = None,
+    usual_priors: Priors = _USUAL_PRIORS,
     update_priors: bool = True,
     coarse_search: bool = True,
     extra_parameters: Sequence[ExtraParameter] = (),
@@ -263,7 +271,7 @@ def fit_registration(
         _require_fittable(matrix, model, columns)
         weighted = apply_model_weights(WeightedMatrix.from_columns(matrix, columns), model)
     context = SolverContext(
-        matrix, model, columns, solver, learning_rate, max_iterations, priors or Priors(),
+        matrix, model, columns, solver, learning_rate, max_iterations, priors or usual_priors, usual_priors,
         build_extra_parameters(model, extra_parameters),
     )  # fmt: skip
     weighted, solution = yield from _in_one_thread(

@@ -38,7 +38,7 @@ N_ACTUATOR_EFFECTS = len(_ACTUATOR_PRIORS)
 #: were free, a common gain far too large with all actuators far below it would bring them closer to each
 #: other, which their prior rewards.
 _MEAN_STIFFNESS = 1e3
-#: Limits of the estimated scatter relative to the default priors.
+#: Limits of the estimated scatter relative to the usual priors.
 _MIN_PRIOR_RATIO, _MAX_PRIOR_RATIO = 0.05, 3.0
 #: Relative change of the fitted matrix below which derivatives are kept: they change by about as much. With
 #: five times as much, solutions for matrices of high signal-to-noise ratio differ by their stated errors.
@@ -106,6 +106,8 @@ class MixedEffectsProblem:
     earlier
         A problem with the same model that was solved before, of which terms of the shape are used, and the
         derivatives at its solution if the matrix is the same, too.
+    usual_priors
+        Scatter that the limits of the estimated one are relative to.
     """
 
     def __init__(
@@ -116,9 +118,10 @@ class MixedEffectsProblem:
         command_curves: Sequence[NDArray[np.float64]] = (),
         extras: Sequence[ExtraParameterModel] = (),
         earlier: MixedEffectsProblem | None = None,
+        usual_priors: Priors | None = None,
     ) -> None:
         self.weighted, self.command_curves, self.priors = weighted, tuple(command_curves), priors
-        self.extras = tuple(extras)
+        self.extras, self._usual_priors = tuple(extras), usual_priors or Priors()
         self.model, self.modes = model, self.weighted.modes
         self.variants = tuple(model.variants())
         rows, cols = np.nonzero(weighted.valid)
@@ -326,7 +329,7 @@ class MixedEffectsProblem:
     def estimate_priors(self, state: MixedEffectsState, system: NormalEquations) -> PriorEstimate:
         """Estimate the scatter of the random effects from a solution (:func:`estimate_scatters`)."""
         groups = self._effect_groups(system)
-        usual, inner = Priors(), len(system.schur_complement)
+        usual, inner = self._usual_priors, len(system.schur_complement)
         bounds = {
             name: (_MIN_PRIOR_RATIO * getattr(usual, name), _MAX_PRIOR_RATIO * getattr(usual, name))
             for name in (*groups, "slope_gain")

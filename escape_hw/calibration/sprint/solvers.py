@@ -69,6 +69,7 @@ class SolverContext:
     learning_rate: float
     max_iterations: int
     priors: Priors
+    usual_priors: Priors
     extras: tuple[ExtraParameterModel, ...] = ()
     history: list[SprintIteration] = field(default_factory=list)
     report: Reporter = field(init=False)
@@ -175,7 +176,12 @@ def solve(
         start = fit.alpha
     if solver == "mixed-effects":
         problem = context.problem = MixedEffectsProblem(
-            weighted, model, context.priors, extras=context.extras, earlier=context.problem
+            weighted,
+            model,
+            context.priors,
+            extras=context.extras,
+            earlier=context.problem,
+            usual_priors=context.usual_priors,
         )
         state = state or problem.initial_state(Registration.from_array(start))
         solution = yield from _fit_mixed_effects(problem, state, context, rough)

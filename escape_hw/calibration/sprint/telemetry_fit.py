@@ -35,7 +35,6 @@ from escape_hw.calibration.docrime.whitening import (
     fit_prediction_error_filter,
 )
 from escape_hw.calibration.sprint.fit import SprintOptions, fit_registration
-from escape_hw.calibration.sprint.normal_equations import Priors
 from escape_hw.errors import TooFewFrames
 
 #: Iterations over registration, response, whitening filter and priors; a fifth changes nothing relevant.
@@ -162,7 +161,7 @@ def fit_telemetry(
     """
     filters = [np.ones(1), np.array([1.0, -1.0])][: 2 if order else 1]
     matrix = template.data.astype(np.float64) if data.closed else None
-    priors, n_effective_parameters, state = Priors(), 0.0, None
+    priors, n_effective_parameters, state = options["usual_priors"], 0.0, None
     rounds = _CLOSED_LOOP_ROUNDS if data.closed else _OPEN_LOOP_ROUNDS
     for number in range(rounds):
         frames = _WhitenedFrames.from_telemetry(data, filters, lags)

@@ -44,12 +44,6 @@ if TYPE_CHECKING:
 _OUTER_SCALE = 4.0
 #: Pupil diameters over r0 below which turbulence does not change the response.
 _NEGLIGIBLE_STRENGTH = 0.5
-#: Systematic error of the scalings under turbulence and pokes, in % of the diameter: the limit that a mean
-#: over some twenty realisations gives (docs/decisions/0018-pyramid-registration-uncertainties.md).
-_SCALING_SYSTEMATIC = 0.05
-#: Relative gain error of slopes at the rim (measured: 0.2 to 0.3): pixels saturate where pokes
-#: concentrate the light, and the pokes' effect at the rim is only approximately known.
-_GAIN_TREND = 0.3
 #: Pixels with less relative flux are vignetted or contaminated on a telescope; their squares are weighted
 #: by ``_MIN_SLOPE_WEIGHT`` unless they are the majority.
 _MIN_RELATIVE_FLUX = 0.85
@@ -62,12 +56,10 @@ _SHARPER = 0.5
 _SHARPER_PROFILE = 0.7
 #: Mirror shapes whose response is computed for each turbulence state.
 _N_SHAPES = 10
-#: Relative uncertainty of the turbulence strength, and ellipticity of the modulation.
-_STRENGTH_UNCERTAINTY, _ELLIPSE = 0.4, 0.05
-#: Uncertainty in pixels of the images' relative positions, and its relevant pattern: opposite shifts of the
-#: diagonal pairs mix derivatives of the y slopes into the x slopes, as a registration shift does. Other
-#: patterns displace images whose sum is used or whose difference does not depend on the phase.
-_IMAGE_POSITION_ERROR_PX, _DIAGONALS = 0.1, np.array([1.0, -1.0, -1.0, 1.0])
+#: The relevant pattern of errors of the images' relative positions: opposite shifts of the diagonal pairs mix
+#: derivatives of the y slopes into the x slopes, as a registration shift does. Other patterns displace images
+#: whose sum is used or whose difference does not depend on the phase.
+_DIAGONALS = np.array([1.0, -1.0, -1.0, 1.0])
 
 #: Kinds of the factors along x and y in the derivatives by the positions and by the logarithms of the widths.
 _DERIVATIVE_KINDS = ((1, 0), (0, 1), (2, 0), (0, 2))
@@ -157,14 +149,13 @@ class PyramidModel(DesignModel):
     def registration_systematic_error(self) -> NDArray[np.float64]:
         """Errors by images, turbulence and place of the maps, see :class:`HasSystematicError`."""
         shift = 100 * self._pupils.centre_sigma_px * self._pupil.n_sub / self._pupils.diameter_px
-        scaling = _SCALING_SYSTEMATIC if self.turbulence or self._pokes else 0.0
-        images = np.hypot([shift, shift, 0.0, scaling, scaling], self._turbulence_uncertainty())
+        images = np.hypot([shift, shift, 0.0, 0.0, 0.0], self._turbulence_uncertainty())
         return np.asarray(np.hypot(images, super().registration_systematic_error))
 
     @property
     def gain_trend(self) -> float:
         """Scatter of trends of the slopes' gains, see :class:`HasGainTrend`; 0 for a static pyramid."""
-        return _GAIN_TREND if self.turbulence or self._pokes else 0.0
+        return self._config.sensor_as(PyramidSection).gain_trend if self.turbulence or self._pokes else 0.0
 
     @property
     def slope_weights(self) -> NDArray[np.float64]:
@@ -275,15 +266,18 @@ class PyramidModel(DesignModel):
         """Models with stronger turbulence, elliptic modulation, or displaced images."""
         if self._variants is None:
             changes: list[PyramidModel] = []
+            section = self._config.sensor_as(PyramidSection)
             if self.turbulence:
-                changes.append(self._variant(turbulence=self.turbulence * (1 + _STRENGTH_UNCERTAINTY)))
+                changes.append(self._variant(turbulence=self.turbulence * (1 + section.turbulence_sigma)))
             radius = self._pupils.modulation
             for angle in (0.0, np.pi / 4) if radius else ():
-                elliptic = ModulationPath.circle(radius, ellipse=_ELLIPSE, ellipse_angle=angle)
+                elliptic = ModulationPath.circle(
+                    radius, ellipse=section.ellipticity_sigma, ellipse_angle=angle
+                )
                 changes.append(self._variant(modulation=elliptic))
             for axis in range(2):
                 centres = self._pupils.centres_px.copy()
-                centres[:, axis] += _IMAGE_POSITION_ERROR_PX * _DIAGONALS
+                centres[:, axis] += section.image_position_sigma_px * _DIAGONALS
                 changes.append(self._variant(pupils=replace(self._pupils, centres_px=centres)))
             self._variants = changes
         return list(self._variants)

@@ -392,8 +392,6 @@ def _apply_to_factors(table, first_y, first_x, side, y, out):  # type: ignore[no
                         out[4, axis, s, a] += y[2, row, a] * line[a]
 
 
-#: Relative uncertainty of the spots' motion: blur within the lenslets is counted as motion, too.
-_MOTION_UNCERTAINTY = 0.25
 #: Up to this many modes, forming their surfaces is faster than the slopes of all actuators.
 _MAX_DIRECT_MODES = 12
 #: Actuator pitch in lenslets up to which the shapes of pokes within lenslets count: with 2.4 they do not.
@@ -582,8 +580,9 @@ class ShackHartmannModel(DesignModel):
     def variants(self) -> list[ShackHartmannModel]:
         """The model with motion and pokes larger by the motion's uncertainty, see :class:`SyntheticModel`."""
         if self._variants is None:
-            grid = replace(self._grid, motion_px=self._grid.motion_px * (1 + _MOTION_UNCERTAINTY))
-            wavefronts = [(1 + _MOTION_UNCERTAINTY) * one for one in self._wavefronts_m]
+            larger = 1 + self._config.sensor_as(ShackHartmannSection).motion_sigma
+            grid = replace(self._grid, motion_px=self._grid.motion_px * larger)
+            wavefronts = [larger * one for one in self._wavefronts_m]
             varied = ShackHartmannModel(self._config, grid, wavefronts)
             self._variants = [varied] if grid.motion_px or wavefronts else []
         return list(self._variants)
