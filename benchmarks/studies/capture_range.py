@@ -20,6 +20,7 @@ from realisation_tables import Line, each_realisation, realisation_numbers, stud
 
 from escape_hw.api.registration import Registration
 from escape_hw.calibration.sprint.fit import sprint
+from escape_hw.io.provenance import get_git_state
 from escape_hw.paper.sky_time import registration_overrides, simulated_config
 from escape_hw.runtime.session.system import System
 
@@ -52,7 +53,7 @@ def run_realisation(system: str, number: int) -> Line:
     right = bool((np.abs(error) <= limits).all())
     outcome = ("recovered" if right else "wrong") if found.converged else "flagged"
     return {
-        "outcome": outcome, "injected": injected.to_array().tolist(), "error": error.tolist(),
+        "commit": get_git_state(), "outcome": outcome, "injected": injected.to_array().tolist(), "error": error.tolist(),
         "steps": len(found.iterations), "warnings": list(found.warnings),
     }  # fmt: skip
 
