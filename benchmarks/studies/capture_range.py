@@ -53,8 +53,8 @@ def run_realisation(system: str, number: int) -> Line:
     right = bool((np.abs(error) <= limits).all())
     outcome = ("recovered" if right else "wrong") if found.converged else "flagged"
     return {
-        "commit": get_git_state(), "outcome": outcome, "injected": injected.to_array().tolist(), "error": error.tolist(),
-        "steps": len(found.iterations), "warnings": list(found.warnings),
+        "commit": get_git_state(), "outcome": outcome, "steps": len(found.iterations),
+        "injected": injected.to_array().tolist(), "error": error.tolist(), "warnings": list(found.warnings),
     }  # fmt: skip
 
 
