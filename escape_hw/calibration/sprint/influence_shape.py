@@ -26,9 +26,8 @@ _N_LOBES = 8
 #: a third of them.
 _PROFILE_SIGMA, _FOURFOLD_SIGMA = 0.3, 0.05
 _EDGE_GAIN_SIGMA, _EDGE_WIDTH_SIGMA, _EDGE_PROFILE_SIGMA, _EDGE_ASYMMETRY_SIGMA = 0.2, 0.1, 0.1, 0.1
-#: Changes of registration, in its units, and width below which these terms, a few per cent of the matrix, are
-#: kept.
-_KEEP_WITHIN = np.array([5.0, 5.0, 0.1, 0.2, 0.2, 0.01])
+#: Changes of registration, in its units, and width below which terms of some per cent of the matrix are kept.
+KEEP_WITHIN = np.array([5.0, 5.0, 0.1, 0.2, 0.2, 0.01])
 #: Half step of derivatives by position, in % of a sub-aperture.
 _SHIFT_STEP = 2.0
 #: Actuators closer than this many pitches are neighbours.
@@ -219,7 +218,7 @@ class InfluenceShape:
         the four-fold ones are neglected.
         """
         at = np.append(registration.to_array(), width)
-        if self._directed_at is None or (np.abs(at - self._directed_at) >= _KEEP_WITHIN).any():
+        if self._directed_at is None or (np.abs(at - self._directed_at) >= KEEP_WITHIN).any():
             self._directed_at = at
             self._directed = (
                 self._fourfold_terms(registration, width),

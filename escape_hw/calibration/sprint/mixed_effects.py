@@ -19,7 +19,7 @@ from escape_hw.api.synthetic_model import HasGainTrend, SyntheticModel
 from escape_hw.calibration.modes.derivatives import modal_matrix, zonal_jacobian
 from escape_hw.calibration.sprint.covariance import LinearisedProblem
 from escape_hw.calibration.sprint.extra_parameters import ExtraParameterModel, FittedExtraParameter
-from escape_hw.calibration.sprint.influence_shape import InfluenceShape
+from escape_hw.calibration.sprint.influence_shape import KEEP_WITHIN, InfluenceShape
 from escape_hw.calibration.sprint.normal_equations import NormalEquations, Priors, normal_equations
 from escape_hw.calibration.sprint.weighted_matrix import WeightedMatrix
 from escape_hw.pipeline.statistics import root_mean_square
@@ -91,6 +91,30 @@ class _ZonalMatrices:
     total: NDArray[np.float64]
 
 
+class VariantDerivatives:
+    """Changes of a model's derivatives in its variants, kept as long as the registration hardly changes."""
+
+    def __init__(self, model: SyntheticModel, variants: Sequence[SyntheticModel]) -> None:
+        self._model, self._variants = model, variants
+        self._at: NDArray[np.float64] | None = None
+        self._base: NDArray[np.float64] | None = None
+        self._changes: dict[int, NDArray[np.float32]] = {}
+
+    def change(self, number: int, registration: Registration, width: float) -> NDArray[np.float32]:
+        """Derivatives of a variant less those of the model ``(6, n_slopes, n_act)``."""
+        at = np.append(registration.to_array(), width)
+        if self._at is None or (np.abs(at - self._at) >= KEEP_WITHIN).any():
+            self._at, self._base = at, None
+            self._changes.clear()
+        if number not in self._changes:
+            here, w = Registration.from_array(self._at[:5]), float(self._at[5])
+            if self._base is None:
+                self._base = zonal_jacobian(self._model, here, w)[1]
+            difference = zonal_jacobian(self._variants[number], here, w)[1] - self._base
+            self._changes[number] = difference.astype(np.float32)
+        return self._changes[number]
+
+
 class MixedEffectsProblem:
     """Fit of registration, common parameters and random effects to a weighted matrix.
 
@@ -134,6 +158,9 @@ class MixedEffectsProblem:
         self.kept: tuple[_ZonalMatrices, NormalEquations] | None = None
         if earlier and earlier.weighted is weighted:
             self.kept = earlier.kept
+        self.variant_derivatives: VariantDerivatives = (
+            earlier.variant_derivatives if earlier else VariantDerivatives(model, self.variants)
+        )
         self.trends = slope_trends(model, weighted.valid)
         self.precision = np.concatenate([
             np.zeros(6), [priors.width**-2], (priors.shape_scale * self.shape.prior_sigma) ** -2.0,
@@ -196,16 +223,11 @@ class MixedEffectsProblem:
         registration, w = Registration.from_array(state.alpha), 1.0 + state.width
         shaped = self.shape.linearise(registration, w, state.shape)
         jacobian, variants = shaped.jacobian, []
-        base = None
-        for variant, share in zip(self.variants, state.variant, strict=False):
-            if abs(share) < _SMALL_SHARE:
-                variants.append(variant.zonal_matrix(registration, w) - shaped.nominal)
-                continue
+        for number, (variant, share) in enumerate(zip(self.variants, state.variant, strict=False)):
+            variants.append(variant.zonal_matrix(registration, w) - shaped.nominal)
             # A large share changes the derivatives by the registration.
-            changed, changes = zonal_jacobian(variant, registration, w)
-            base = zonal_jacobian(self.model, registration, w)[1] if base is None else base
-            variants.append(changed - shaped.nominal)
-            jacobian = jacobian + share * (changes - base)
+            if abs(share) >= _SMALL_SHARE:
+                jacobian = jacobian + share * self.variant_derivatives.change(number, registration, w)
 
         def profile_matrix(model: SyntheticModel, at: Registration) -> NDArray[np.float64]:
             return self.shape.profile_matrix(model, at, w, state.shape)
