@@ -155,7 +155,7 @@ def _revolt_numbers(run: RunContent | None) -> Iterator[PaperNumber]:
             columns.append(f"injected {getattr(run.injected, name):g}".replace("-", "−"))
         what = f"REVOLT, SHORT and LONG: {title} [{unit}]"
         yield PaperNumber(what, "no number", "; ".join(columns) or None)
-    paired = {} if run is None else run.document["paired"]
+    paired = {} if run is None else run.document.get("paired", {})
     for matrix in ("push-pull", "DO-CRIME", "ESCAPE"):
         found = _mean_strehl(paired, matrix)
         yield PaperNumber(f"REVOLT, Strehl of {matrix}, mean over seeds", "no number", found)
