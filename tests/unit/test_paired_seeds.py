@@ -64,7 +64,7 @@ def test_every_matrix_of_a_seed_starts_from_the_same_state(document, twins, tmp_
 def test_numbers_by_seed_are_saved_and_shown(escape, reports, twins, tmp_path):
     code, out, err = escape(*WORDS, *INJECTED, "--out", tmp_path / "run")
     assert code == 0, err
-    for word in ("α SHORT", "α LONG", "ESCAPE minus push-pull", "95 % interval", "loop stable for every seed"):
+    for word in ("α SHORT", "α LONG", "ESCAPE minus push-pull", "95 % interval", "stable for every seed"):
         assert word in out
     page = (tmp_path / "run" / "report.html").read_text()
     for word in ("Paired loops", "ESCAPE minus DO-CRIME", "two-sided", "Stacked closed-loop PSFs"):
