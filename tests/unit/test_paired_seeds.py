@@ -5,9 +5,7 @@ from __future__ import annotations
 import json
 import os
 import signal
-from types import SimpleNamespace
 
-import fake_bench
 import numpy as np
 import pytest
 
@@ -29,39 +27,27 @@ INJECTED = [
 WORDS = ("reproduce", "revolt", "--seeds", 3, "--short", 1000, "--long", 5000, "--loop-frames", 321)
 
 
-@pytest.fixture
-def twins(bench, monkeypatch):
-    """Stand-ins in place of the twins that the procedure opens."""
-
-    def from_config(config):
-        bench.benches.append(fake_bench.FakeBench(config))
-        return bench.benches[-1]
-
-    monkeypatch.setattr(paired_seeds, "Bench", SimpleNamespace(from_config=from_config))
-    return bench
-
-
 def revolt(document, tmp_path):
     return document(*WORDS, *INJECTED, "--out", tmp_path / "run")
 
 
-def test_every_matrix_of_a_seed_starts_from_the_same_state(document, twins, tmp_path):
+def test_every_matrix_of_a_seed_starts_from_the_same_state(document, bench, tmp_path):
     code, found, err = revolt(document, tmp_path)
     assert code == 0, (err, found["criteria"])
-    names = [(name, options.get("frames")) for name, options in twins.calls if name != "best_gain"]
+    names = [(name, options.get("frames")) for name, options in bench.calls if name != "best_gain"]
     loops = 3 * [("closed_loop", 321)]
     # ESCAPE of the first seed is SHORT.
     assert names[:6] == [("escape", 1000), ("escape", 5000), ("push-pull", None), *loops]
     assert names[6:] == 2 * [("escape", 1000), ("push-pull", None), *loops]
-    with_loops = [one for one in twins.benches if "loop" in one.screen_seen]
+    with_loops = [one for one in bench.benches if "loop" in one.screen_seen]
     # The mirror is the seed's, the turbulence that of no calibration and of no search.
     seeds = [(one.config.system.seed, one.config.twin.run_seed) for one in with_loops]
     assert seeds == 3 * [(1, 1)] + 3 * [(2, 2)] + 3 * [(3, 3)]
-    assert all(one.closed for one in twins.benches)
-    assert twins.benches[0].config.calibration.push_pull_frames == paired_seeds.PUSH_PULL_FRAMES
+    assert all(one.closed for one in bench.benches)
+    assert bench.benches[0].config.calibration.push_pull_frames == paired_seeds.PUSH_PULL_FRAMES
 
 
-def test_numbers_by_seed_are_saved_and_shown(escape, reports, twins, tmp_path):
+def test_numbers_by_seed_are_saved_and_shown(escape, reports, bench, tmp_path):
     code, out, err = escape(*WORDS, *INJECTED, "--out", tmp_path / "run")
     assert code == 0, err
     for word in ("α SHORT", "α LONG", "ESCAPE minus push-pull", "95 % interval", "stable for every seed"):
@@ -78,13 +64,13 @@ def test_numbers_by_seed_are_saved_and_shown(escape, reports, twins, tmp_path):
     assert "injected −71" in rows
 
 
-def test_a_matrix_without_a_stable_loop_counts_with_zero(document, twins, monkeypatch, tmp_path):
-    search = twins.find_best_gain
+def test_a_matrix_without_a_stable_loop_counts_with_zero(document, bench, monkeypatch, tmp_path):
+    search = bench.find_best_gain
 
-    def find_best_gain(bench, matrix, grid, **options):
-        if matrix.method == "push-pull" and bench.config.system.seed == 2:
+    def find_best_gain(twin, matrix, grid, **options):
+        if matrix.method == "push-pull" and twin.config.system.seed == 2:
             raise CalibrationError("the loop closes at none of the gains 0.45, 0.64")
-        return (yield from search(bench, matrix, grid, **options))
+        return (yield from search(twin, matrix, grid, **options))
 
     monkeypatch.setattr("escape_hw.calibration.loop.gain_search.find_best_gain", find_best_gain)
     code, found, err = revolt(document, tmp_path)
@@ -97,23 +83,23 @@ def test_a_matrix_without_a_stable_loop_counts_with_zero(document, twins, monkey
     assert difference["mean"] == pytest.approx(0.62 / 3)
 
 
-def test_an_unstable_loop_of_escape_is_not_met(document, twins, tmp_path):
+def test_an_unstable_loop_of_escape_is_not_met(document, bench, tmp_path):
     def unstable(name: str) -> None:
-        twins.changes = {"stable": False} if name == "closed_loop" else {}
+        bench.changes = {"stable": False} if name == "closed_loop" else {}
 
-    twins.hook = unstable
+    bench.hook = unstable
     code, found, _ = revolt(document, tmp_path)
     assert code == 1
     unmet = [check["text"] for check in found["criteria"] if not check["met"]]
     assert unmet == ["ESCAPE: loop stable for every seed (not for 1, 2, 3)"]
 
 
-def test_ctrl_c_keeps_the_finished_seeds(document, twins, tmp_path):
+def test_ctrl_c_keeps_the_finished_seeds(document, bench, tmp_path):
     def stop(name: str) -> None:
-        if twins.benches[-1].config.system.seed == 3:
+        if bench.benches[-1].config.system.seed == 3:
             os.kill(os.getpid(), signal.SIGINT)
 
-    twins.hook = stop
+    bench.hook = stop
     code, found, _ = revolt(document, tmp_path)
     assert code == 130
     assert found["partial"] is True
@@ -123,11 +109,11 @@ def test_ctrl_c_keeps_the_finished_seeds(document, twins, tmp_path):
     assert {"escape_short", "escape_long", "push_pull", "loop_escape"} <= set(found["products"])
 
 
-def test_loops_too_short_for_a_strehl_ratio_are_refused(document, twins, tmp_path):
+def test_loops_too_short_for_a_strehl_ratio_are_refused(document, bench, tmp_path):
     code, found, _ = document(*WORDS[:-1], 100, "--out", tmp_path / "run")
     assert code == 2
     assert found["error"]["message"] == "loops of 100 frames give no Strehl ratio; use at least 270"
-    assert twins.calls == []
+    assert bench.calls == []
 
 
 def test_the_interval_is_students():
