@@ -17,7 +17,8 @@ def paired_section(document: Mapping[str, Any]) -> str:
     caption = (
         "Strehl ratio (peak) in % of the loop with each matrix at its own best gain, on turbulence that the "
         "matrices of a seed share. Each seed is a mirror and turbulence of its own. A matrix without a "
-        "stable loop counts with 0. Registration: largest error of ESCAPE's in standard errors."
+        "stable loop counts with 0. Registration: largest error of ESCAPE's in standard errors. Loops and "
+        "matrices below are those of the first seed."
     )
     parts = [html.table(strehl_by_seed_table(paired), caption)]
     if paired["differences"]:
