@@ -33,7 +33,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from realisation_tables import Line, append_line, each_realisation, read_lines, study_parser
-from scipy import stats
 
 from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.registration import PARAMETERS, UNITS
@@ -49,6 +48,7 @@ from escape_hw.config.sensor import PyramidSection
 from escape_hw.errors import CalibrationError
 from escape_hw.io.fits.matrix import load_matrix, save_matrix
 from escape_hw.io.provenance import get_git_state
+from escape_hw.pipeline.statistics import mean_interval
 from escape_hw.runtime.session.record import BenchRecord
 from escape_hw.runtime.session.system import System, open_system
 from escape_sim.devices.true_optical_gains import get_simulated_bench
@@ -273,14 +273,6 @@ def measure_seed(options: argparse.Namespace, number: int, until: float) -> Line
     }  # fmt: skip
 
 
-def interval(values: NDArray[np.float64]) -> str:
-    """Mean with its two-sided 95 % interval."""
-    if values.size < 2:
-        return f"{values.mean():+.2f} (one seed, no interval)"
-    half = stats.t.ppf(0.975, values.size - 1) * values.std(ddof=1) / np.sqrt(values.size)
-    return f"{values.mean():+.2f}, 95 % interval {values.mean() - half:+.2f} to {values.mean() + half:+.2f}"
-
-
 def strehl_lines(rows: Sequence[Line]) -> list[str]:
     """Table of Strehl ratios by seed, and the differences paired by seed."""
     names = [name for name in PAIRED if any(name in row["strehl"] for row in rows)]
@@ -293,7 +285,7 @@ def strehl_lines(rows: Sequence[Line]) -> list[str]:
     for one, other in combinations(names, 2):
         difference = values[one] - values[other]
         known = difference[np.isfinite(difference)]
-        lines.append(f"- {one} minus {other}, n = {known.size}: {interval(known)} % of Strehl ratio")
+        lines.append(f"- {one} minus {other}, n = {known.size}: {mean_interval(known)} % of Strehl ratio")
     return lines
 
 

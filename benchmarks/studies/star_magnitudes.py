@@ -24,13 +24,13 @@ from loop_comparison import (
     GAINS,
     comparison_parser,
     complete_options,
-    interval,
     measure_seed,
 )
 from matplotlib.axes import Axes
 from realisation_tables import Line, each_realisation
 
 from escape_hw.errors import CalibrationError
+from escape_hw.pipeline.statistics import mean_interval
 from escape_hw.report.figures.style import SERIES, legend, new_figure, style_axes
 
 NAMES = (ESCAPE, DOCRIME)
@@ -73,8 +73,8 @@ def print_table(tables: dict[float, list[Line]]) -> None:
         errors, sigmas = shift_errors(rows)
         print(
             f"| {magnitude:g} | {' | '.join(f'{one.mean():.1f}' for one in values)} | "
-            f"{interval(values[0] - values[-1])} | {len(errors) // 2} of {len(rows)} | {_rms(errors):.2g} | "
-            f"{_rms(sigmas):.2g} |"
+            f"{mean_interval(values[0] - values[-1])} | {len(errors) // 2} of {len(rows)} | "
+            f"{_rms(errors):.2g} | {_rms(sigmas):.2g} |"
         )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -20,9 +20,16 @@ from escape_hw.paper.experiments import (
     Table1Result,
     reproduce_maps,
     reproduce_pywfs,
-    reproduce_revolt,
     reproduce_shwfs,
     reproduce_table1,
+)
+from escape_hw.paper.paired_seeds import (
+    LONG_FRAMES,
+    PUSH_PULL_FRAMES,
+    SHORT_FRAMES,
+    PairedSeeds,
+    paired_document,
+    reproduce_revolt,
 )
 from escape_hw.runtime.procedures import criteria
 from escape_hw.runtime.procedures.calibration import measured_calibration
@@ -129,27 +136,10 @@ def save_table1(
     folder: RunFolder, record: BenchRecord, result: Table1Result, wall_seconds: float
 ) -> dict[str, Any]:
     """As :func:`save_comparison`, of :func:`~escape_hw.paper.experiments.reproduce_table1`."""
-    labels, checks, estimates = {}, [], {}
-    for column, calibration in result.calibrations.items():
-        estimate = calibration.registration
-        # Stopped before SPRINT, only the DO-CRIME matrix exists.
-        measured = calibration if estimate is None else measured_calibration(calibration)
-        parents = []
-        if measured is not None:
-            source = product_key(f"docrime {column}")
-            parents = [add_result(folder, record, source, measured)]
-            labels[source] = {"label": f"DO-CRIME {column}"}
-        if estimate is None:
-            continue
-        name = product_key(f"escape {column}")
-        add_result(folder, record, name, calibration, *parents)
-        labels[name] = {"label": f"ESCAPE {column}", "measured": f"DO-CRIME {column}", "column": column}
-        checks.append(criteria.sprint_converged(column, estimate))
-        estimates[column] = estimate
-        if record.injected is not None:
-            checks.append(criteria.injected_value_recovered(column, estimate, record.injected))
+    labels, checks, _ = _save_registrations(folder, record, result)
+    estimates = [one.registration for one in result.calibrations.values() if one.registration is not None]
     if len(estimates) == 2:
-        checks += criteria.short_and_long_agree(*estimates.values())
+        checks += criteria.short_and_long_agree(*estimates)
     return save_run(
         folder, record, "reproduce table1",
         f"Registration from short and long runs: {record.system}", wall_seconds,
@@ -158,6 +148,80 @@ def save_table1(
         labels=labels,
         partial=result.partial,
     )  # fmt: skip
+
+
+def _save_registrations(
+    folder: RunFolder, record: BenchRecord, result: Table1Result
+) -> tuple[dict[str, dict[str, str]], list[dict[str, Any]], dict[str, Path]]:
+    """Save the calibrations by column; returns labels of the products, criteria, and files by label."""
+    labels: dict[str, dict[str, str]] = {}
+    checks, saved = [], dict[str, Path]()
+    for column, calibration in result.calibrations.items():
+        estimate = calibration.registration
+        # Stopped before SPRINT, only the DO-CRIME matrix exists.
+        measured = calibration if estimate is None else measured_calibration(calibration)
+        parents = []
+        if measured is not None:
+            source = f"DO-CRIME {column}"
+            saved[source] = add_result(folder, record, product_key(source), measured)
+            parents = [saved[source]]
+            labels[product_key(source)] = {"label": source}
+        if estimate is None:
+            continue
+        label = f"ESCAPE {column}"
+        saved[label] = add_result(folder, record, product_key(label), calibration, *parents)
+        labels[product_key(label)] = {"label": label, "measured": f"DO-CRIME {column}", "column": column}
+        checks.append(criteria.sprint_converged(column, estimate))
+        if record.injected is not None:
+            checks.append(criteria.injected_value_recovered(column, estimate, record.injected))
+    return labels, checks, saved
+
+
+def save_paired_seeds(
+    folder: RunFolder, record: BenchRecord, result: PairedSeeds, wall_seconds: float
+) -> dict[str, Any]:
+    """As :func:`save_comparison`, of :func:`~escape_hw.paper.paired_seeds.reproduce_revolt`.
+
+    Matrices and loops are those of the first seed; ``paired`` has the numbers of all.
+    """
+    labels, checks, saved = _save_registrations(folder, record, result.registrations)
+    first = result.seeds[0] if result.seeds else None
+    if first is not None:
+        # ESCAPE and DO-CRIME of the first seed are those of SHORT.
+        saved = {label.removesuffix(" SHORT"): path for label, path in saved.items()}
+        if "push-pull" in first.calibrations:
+            baseline = first.calibrations["push-pull"]
+            saved["push-pull"] = add_result(folder, record, "push_pull", baseline, saved["ESCAPE"])
+            labels["push_pull"] = {"label": "push-pull"}
+        for label, loop in first.loops.items():
+            name = f"loop_{product_key(label)}"
+            add_result(folder, record, name, loop, saved[label])
+            labels[name] = {"label": label}
+    scans = {} if first is None else first.scans
+    return save_run(
+        folder, record, "reproduce revolt",
+        f"Registration, and loops on equal turbulence: {record.system}", wall_seconds,
+        registrations={
+            k: documents.calibration_document(v) for k, v in result.registrations.calibrations.items()
+        },
+        paired=paired_document(result),
+        scans={k: [documents.loop_document(run) for run in runs] for k, runs in scans.items()},
+        criteria=[] if result.partial else [*checks, *_paired_criteria(result)],
+        labels=labels,
+        partial=result.partial,
+    )  # fmt: skip
+
+
+def _paired_criteria(result: PairedSeeds) -> Iterator[dict[str, Any]]:
+    """ESCAPE's registration and loop for every seed, and its Strehl ratio; the others may diverge."""
+    for one in result.seeds:
+        label = f"ESCAPE, seed {one.seed}"
+        yield criteria.sprint_converged(label, one.estimate)
+        if one.estimate is not None:
+            yield criteria.injected_value_recovered(label, one.estimate, one.injected)
+    unstable = [one.seed for one in result.seeds if not one.is_stable("ESCAPE")]
+    yield criteria.stable_for_every_seed("ESCAPE", unstable)
+    yield criteria.strehl_not_worse("ESCAPE", "DO-CRIME", result.difference("ESCAPE", "DO-CRIME"))
 
 
 # ---------------------------------------------------------------- the cases
@@ -192,9 +256,10 @@ CASES = {
             _save("maps", "Calibration on the sky, with a contaminated mirror"),
         ),
         PaperCase(
-            "revolt", "telescope with a Shack-Hartmann sensor: matrices and loops", "revolt-shwfs",
-            {"frames": 10_000, "loop_frames": 10_000}, reproduce_revolt,
-            _save("revolt", "Calibration on the sky"),
+            "revolt", "telescope with a Shack-Hartmann sensor: registration and paired loops", "revolt-shwfs",
+            # The loops are as short as they can be; a share shortens the calibrations only.
+            {"short": SHORT_FRAMES, "long": LONG_FRAMES}, reproduce_revolt, save_paired_seeds,
+            (f"calibration.push_pull_frames={PUSH_PULL_FRAMES}",),
         ),
     )
 }  # fmt: skip

@@ -186,36 +186,6 @@ def _gains_and_loops(
             return
 
 
-def reproduce_revolt(
-    bench: Bench, *, frames: int = SHORT_FRAMES, loop_frames: int = 5000
-) -> Procedure[CalibrationComparison]:
-    """Calibrate a telescope with a Shack-Hartmann sensor on a star, and close the loop with every matrix.
-
-    All measurements are on the sky and share the geometry and the slope references of ESCAPE.
-
-    Parameters
-    ----------
-    frames
-        Frames of the DO-CRIME measurement.
-    loop_frames
-        Frames of each closed loop at its best gain.
-
-    Returns
-    -------
-    CalibrationComparison
-        Calibrations and loops of "push-pull", "DO-CRIME" and "ESCAPE".
-
-    Raises
-    ------
-    TooFewFrames
-        For the number of modes; nothing moved.
-    CalibrationError
-        No gain gives a stable loop.
-    """
-    measure = partial(measure_matrices, bench, frames)
-    return (yield from _compare(bench, frames, measure, partial(_close_loops, bench, loop_frames)))
-
-
 def reproduce_maps(
     bench: Bench, *, frames: int = MAPS_FRAMES, loop_frames: int = 5000
 ) -> Procedure[CalibrationComparison]:

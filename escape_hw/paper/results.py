@@ -145,10 +145,36 @@ def _maps_numbers(run: RunContent | None) -> Iterator[PaperNumber]:
 
 
 def _revolt_numbers(run: RunContent | None) -> Iterator[PaperNumber]:
-    for matrix in ("ESCAPE", "DO-CRIME"):
-        found = _difference(run, matrix, "push-pull")
-        yield PaperNumber(f"REVOLT, Strehl of {matrix} minus push-pull", "no number", found)
+    for name in PARAMETERS:
+        title, unit = TITLES[name]
+        columns = [
+            format_with_error(estimate.parameters()[name])
+            for estimate in ({} if run is None else run.estimates()).values()
+        ]
+        if run is not None and run.injected is not None:
+            columns.append(f"injected {getattr(run.injected, name):g}".replace("-", "−"))
+        what = f"REVOLT, SHORT and LONG: {title} [{unit}]"
+        yield PaperNumber(what, "no number", "; ".join(columns) or None)
+    paired = {} if run is None else run.document.get("paired", {})
+    for matrix in ("push-pull", "DO-CRIME", "ESCAPE"):
+        found = _mean_strehl(paired, matrix)
+        yield PaperNumber(f"REVOLT, Strehl of {matrix}, mean over seeds", "no number", found)
+    texts = {(one["first"], one["second"]): one["text"] for one in paired.get("differences", ())}
+    for first, second in (("ESCAPE", "push-pull"), ("DO-CRIME", "push-pull"), ("ESCAPE", "DO-CRIME")):
+        text = texts.get((first, second))
+        ours = None if text is None else text.replace("-", "−")
+        yield PaperNumber(f"REVOLT, Strehl of {first} minus {second}, paired by seed", "no number", ours)
     yield PaperNumber("REVOLT, loop speed", "500 Hz", _loop_speed(run))
+
+
+def _mean_strehl(paired: Mapping[str, Any], matrix: str) -> str | None:
+    """Mean Strehl ratio over the seeds, and for how many of them the loop diverged."""
+    seeds = paired.get("seeds")
+    if not seeds:
+        return None
+    diverged = sum(not one["stable"][matrix] for one in seeds)
+    note = f", of which {diverged} diverged and count with 0" if diverged else ""
+    return f"{100 * paired['mean'][matrix]:.1f} %, {len(seeds)} seeds{note}"
 
 
 def _sweep_numbers(run: RunContent | None) -> Iterator[PaperNumber]:

@@ -1,4 +1,4 @@
-"""Root mean square, standard error of the mean of correlated series, and paired comparison of two means."""
+"""Root mean square, standard error of the mean of correlated series, intervals and paired comparisons."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy import special
 
 #: Fewest values from which a correlation is estimated.
 MIN_SAMPLES = 10
@@ -73,6 +74,36 @@ def _truncation_lag(covariance: NDArray[np.float64]) -> int:
 MIN_PAIRS = 6
 #: Confidence level of all statements.
 CONFIDENCE = 0.95
+
+
+@dataclass(frozen=True, slots=True)
+class MeanInterval:
+    """Mean of ``n`` independent values, and its two-sided interval at :data:`CONFIDENCE`.
+
+    The interval of one value is NaN.
+    """
+
+    mean: float
+    low: float
+    high: float
+    n: int
+
+    def __str__(self) -> str:
+        if self.n < 2:
+            return f"{self.mean:+.2f} (one value, no interval)"
+        return f"{self.mean:+.2f}, {100 * CONFIDENCE:.0f} % interval {self.low:+.2f} to {self.high:+.2f}"
+
+
+def mean_interval(values: NDArray[np.floating]) -> MeanInterval:
+    """Mean of independent, normally distributed values ``(n,)`` with its interval by Student's t."""
+    n, mean = values.size, float(values.mean())
+    if n < 2:
+        return MeanInterval(mean, math.nan, math.nan, n)
+    half = float(special.stdtrit(n - 1, (1 + CONFIDENCE) / 2) * values.std(ddof=1) / math.sqrt(n))
+    return MeanInterval(mean, mean - half, mean + half, n)
+
+
+#: Resamples of a bootstrap.
 _RESAMPLES = 20_000
 
 

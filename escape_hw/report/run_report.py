@@ -21,6 +21,7 @@ from escape_hw.report.figures import registration as figures_registration
 from escape_hw.report.figures import residual as figures_residual
 from escape_hw.report.figures import style
 from escape_hw.report.figures import track as figures_track
+from escape_hw.report.paired import paired_section
 from escape_hw.report.sweep import sweep_section
 from escape_hw.report.verdict import assess
 
@@ -72,6 +73,7 @@ def render_page(run: RunContent) -> str:
         html.section("Criteria", html.criteria_list(document.get("criteria") or [])),
         _registration_section(run),
         _gains_section(run),
+        paired_section(document),
         _loops_section(run),
         sweep_section(document),
         _track_section(run),

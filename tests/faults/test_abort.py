@@ -20,6 +20,7 @@ from escape_hw.calibration.loop.performance import close_loop
 from escape_hw.calibration.push_pull.procedure import push_pull
 from escape_hw.errors import Aborted
 from escape_hw.paper.experiments import reproduce_shwfs, reproduce_table1
+from escape_hw.paper.paired_seeds import reproduce_revolt
 from escape_hw.runtime.procedures.model_psf import model_psf
 from escape_hw.runtime.session.record import without_turbulence
 
@@ -55,11 +56,13 @@ PLACES = {
     "reproduce, DO-CRIME": (lambda b, g: reproduce_shwfs(b, frames=50_000), "DO-CRIME", 0.01),
     "reproduce, model PSF": (lambda b, g: reproduce_shwfs(b, frames=400), "model PSF", 0.0),
     "reproduce, best gain": (lambda b, g: reproduce_shwfs(b, frames=400), "loop at gain", 0.2),
+    "reproduce, paired loops": (lambda b, g: reproduce_revolt(b, short=400, long=400), "loop at gain", 0.2),
     "table 1": (lambda b, g: reproduce_table1(b, frames={"SHORT": 400, "LONG": 99_999}), "DO-CRIME", 0.006),
 }
 #: In the quick suite, parts of what is reproduced are stopped alone, and DO-CRIME once in its stage.
 SLOW = (
-    "reproduce, DO-CRIME", "reproduce, model PSF", "reproduce, best gain", "DO-CRIME, past the burn-in",
+    "reproduce, DO-CRIME", "reproduce, model PSF", "reproduce, best gain", "reproduce, paired loops",
+    "DO-CRIME, past the burn-in",
 )  # fmt: skip
 #: Where nothing is measured yet that could be kept.
 EMPTY = {

@@ -144,6 +144,11 @@ def install(monkeypatch: pytest.MonkeyPatch) -> FakeProcedures:
         made.benches.append(FakeBench(load_system(system, overrides=set, seed=seed, mode=mode)))
         return made.benches[-1]
 
+    def from_config(config: Any) -> FakeBench:
+        made.benches.append(FakeBench(config))
+        return made.benches[-1]
+
     monkeypatch.setattr("escape_hw.runtime.session.system.open_system", open_system)
+    monkeypatch.setattr("escape_hw.paper.paired_seeds.Bench", SimpleNamespace(from_config=from_config))
     monkeypatch.setattr("escape_hw.config.registry.model_factory", lambda name: lambda config, grid: None)
     return made

@@ -100,20 +100,6 @@ def test_reproduce_maps_shows_the_matrix_beside_its_simulation(escape, bench, tm
     assert load_loop(run / "loop_docrime.fits").header["PARENT1"] == "docrime.fits"
 
 
-@pytest.mark.usefixtures("reports")
-def test_reproduce_revolt_measures_all_matrices_with_one_geometry(escape, bench, tmp_path):
-    run = tmp_path / "run"
-    code, out, err = escape("reproduce", "revolt", "--out", run, "--frames", 4000, "--loop-frames", 321)
-    # The stand-in's registration is not the one injected in this system.
-    assert code == 1, err
-    assert bench.benches[0].config.system.name == "revolt-shwfs"
-    assert [name for name, _ in bench.calls if name != "best_gain"] == [
-        "escape", "push-pull", "closed_loop", "closed_loop", "closed_loop",
-    ]  # fmt: skip
-    assert "ESCAPE minus push-pull" in out
-    assert "Stacked closed-loop PSFs" in (run / "report.html").read_text()
-
-
 @pytest.mark.usefixtures("empty_reports", "pictures")
 @pytest.mark.slow
 def test_reproduce_all_leads_to_every_report(escape, document, bench, tmp_path):

@@ -19,6 +19,8 @@ _SHWFS, _PYWFS, _MAPS, _REVOLT = map(
     SystemSelection, ("razor-shwfs", "razor-pywfs", "maps-nir", "revolt-shwfs")
 )
 _LoopFrames = Annotated[int, typer.Option("--loop-frames", min=1, help="Frames of each loop.")]
+_ShortFrames = Annotated[int, typer.Option("--short", min=1, help="Frames of the SHORT run.")]
+_LongFrames = Annotated[int, typer.Option("--long", min=1, help="Frames of the LONG run.")]
 _DocrimeFrames = Annotated[int, typer.Option("--frames", min=1, help="Frames of the DO-CRIME run.")]
 
 
@@ -74,17 +76,23 @@ def maps(
 
 
 @app.command("revolt")
-@command("reproduce revolt", quiet=True)
+@command("reproduce revolt", quiet=True, without=("mode",))
 def revolt(
     context: CommandContext,
     selection: _System = _REVOLT,
-    frames: _DocrimeFrames = 10_000,
-    loop_frames: _LoopFrames = 10_000,
+    short: _ShortFrames = 2500,
+    long: _LongFrames = 10_000,
+    loop_frames: _LoopFrames = 600,
+    seeds: Annotated[int, typer.Option("--seeds", min=2, help="Twins, from --seed on.")] = 5,
     out: options.Out = None,
 ) -> None:
-    """Matrices and loops on the sky, on a telescope with a Shack-Hartmann sensor."""
-    counts = {"frames": frames, "loop_frames": loop_frames}
-    _show_comparison(context, *_run_case(context, "revolt", counts, selection, out))
+    """Registration on the sky, and loops with three matrices on equal turbulence, over several twins."""
+    counts = {"short": short, "long": long, "loop_frames": loop_frames, "seeds": seeds}
+    selection = replace(selection, mode="sim")
+    result, document = _run_case(context, "revolt", counts, selection, out)
+    _show_registration(context, result.registrations.calibrations, document)
+    _show_paired(context, document["paired"])
+    _show_criteria(context, document)
 
 
 @app.command("table1")
@@ -92,8 +100,8 @@ def revolt(
 def table1(
     context: CommandContext,
     selection: _System = _SHWFS,
-    short: Annotated[int, typer.Option("--short", min=1, help="Frames of the SHORT run.")] = 10_000,
-    long: Annotated[int, typer.Option("--long", min=1, help="Frames of the LONG run.")] = 100_000,
+    short: _ShortFrames = 10_000,
+    long: _LongFrames = 100_000,
     out: options.Out = None,
 ) -> None:
     """Registration from 20 seconds and from 3 minutes of data (paper, Table 1)."""
@@ -263,6 +271,14 @@ def _show_registration(context: CommandContext, columns: dict[str, Any], documen
     found = {label: item.registration for label, item in columns.items() if item.registration is not None}
     injected = Registration(**document["injected"]) if document["injected"] else None
     context.show(rich_table(registration_table(found, injected)))
+
+
+def _show_paired(context: CommandContext, paired: dict[str, Any]) -> None:
+    from escape_hw.cli.formatting import rich_table
+    from escape_hw.report.paired import differences_table, paired_notes, strehl_by_seed_table
+
+    context.show(rich_table(strehl_by_seed_table(paired), "Strehl ratio [%] on equal turbulence"))
+    context.show(rich_table(differences_table(paired)), *paired_notes(paired))
 
 
 def _show_criteria(context: CommandContext, document: dict[str, Any]) -> None:

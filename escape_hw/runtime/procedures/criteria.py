@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,7 @@ import numpy as np
 from escape_hw.api.optical_gains import GainsResult
 from escape_hw.api.registration import PARAMETERS, Registration
 from escape_hw.api.results import LoopResult, RegistrationEstimate
+from escape_hw.pipeline.statistics import MeanInterval
 
 #: Differences between SHORT and LONG in the paper's Table 1, to the last digit printed there.
 PAPER_DIFFERENCES = {
@@ -61,14 +62,22 @@ def injected_value_recovered(
     label: str, estimate: RegistrationEstimate, injected: Registration
 ) -> dict[str, Any]:
     """The injected registration lies within the error bars."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        pulls = np.abs(estimate.registration.to_array() - injected.to_array()) / estimate.sigma
-    worst = float(pulls.max())  # NaN, from no error and no difference, counts as not met
+    worst, name = largest_pull(estimate, injected)
     return criterion(
         f"{label}: injected registration recovered within {_LARGEST_PULL:g} standard errors "
-        f"(largest pull {worst:.1f}, {_readable_name(PARAMETERS[int(pulls.argmax())])})",
+        f"(largest pull {worst:.1f}, {_readable_name(name)})",
         worst <= _LARGEST_PULL,
     )
+
+
+def largest_pull(estimate: RegistrationEstimate, injected: Registration) -> tuple[float, str]:
+    """Largest error of a registration in standard errors, and its parameter.
+
+    It is NaN, which counts as not recovered, from no standard error and no difference.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        pulls = np.abs(estimate.registration.to_array() - injected.to_array()) / estimate.sigma
+    return float(pulls.max()), PARAMETERS[int(pulls.argmax())]
 
 
 def short_and_long_agree(short: RegistrationEstimate, long: RegistrationEstimate) -> list[dict[str, Any]]:
@@ -118,3 +127,22 @@ def loop_criteria(results: Mapping[str, LoopResult]) -> list[dict[str, Any]]:
             )
         )
     return criteria_met
+
+
+def stable_for_every_seed(label: str, unstable: Sequence[int]) -> dict[str, Any]:
+    """The loop with a matrix is stable for every seed; ``unstable`` are the seeds for which it is not."""
+    which = f" (not for {', '.join(map(str, unstable))})" if unstable else ""
+    return criterion(f"{label}: loop stable for every seed{which}", not unstable)
+
+
+def strehl_not_worse(first: str, second: str, difference: MeanInterval) -> dict[str, Any]:
+    """The Strehl ratio of a matrix is not below that of another by more than a margin.
+
+    ``difference`` is that of the Strehl ratios in percent, paired by seed.
+    """
+    margin = 100 * STREHL_MARGIN
+    return criterion(
+        f"Strehl (peak) of {first} minus {second}, {difference.n} seeds: {difference} %, "
+        f"not below {margin:.1f} % with all of the interval",
+        difference.high > margin,
+    )
