@@ -76,7 +76,7 @@ def test_a_wrong_pitch_is_named() -> None:
 
 @pytest.mark.parametrize("pattern", [0.0, 3.0])
 def test_an_idle_mirror_is_no_wrong_layout(pattern: float) -> None:
-    """Noise alone, or with slopes that changed by themselves: one pattern, by another amount in each column."""
+    """Noise alone, or with one pattern of slopes, by another amount in each column, that came by itself."""
     matrix, rng = measured(0), np.random.default_rng(0)
     noise = 1.2 * NOISE * rng.normal(size=matrix.data.shape)
     drift = pattern * NOISE * np.outer(*(rng.normal(size=n) for n in matrix.data.shape))
