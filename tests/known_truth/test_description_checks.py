@@ -89,9 +89,13 @@ def test_a_wrong_pitch_is_named() -> None:
     assert any("larger on the sensor than described" in note for note in estimate.notes), estimate.notes
 
 
-def test_noise_alone_is_no_wrong_layout() -> None:
-    matrix = measured(0)
-    noise = 1.2 * NOISE * np.random.default_rng(0).normal(size=matrix.data.shape)
-    estimate = sprint(replace(matrix, data=noise.astype(np.float32)), MODEL)
+@pytest.mark.parametrize("pattern", [0.0, 3.0])
+def test_an_idle_mirror_is_no_wrong_layout(pattern: float) -> None:
+    """Noise alone, or with one pattern of slopes, by another amount in each column, that came by itself."""
+    matrix, rng = measured(0), np.random.default_rng(0)
+    noise = 1.2 * NOISE * rng.normal(size=matrix.data.shape)
+    drift = pattern * NOISE * np.outer(*(rng.normal(size=n) for n in matrix.data.shape))
+    estimate = sprint(replace(matrix, data=(noise + drift).astype(np.float32)), MODEL)
     assert not estimate.converged
     assert "does the mirror move" in estimate.warnings[0]
+    assert ("one pattern of slopes" in estimate.warnings[0]) == bool(pattern)

@@ -20,6 +20,7 @@ from small_system import SMALL
 from escape_hw.api.camera import Region
 from escape_hw.config.loader import load_system
 from escape_hw.errors import DeviceError, DeviceLost
+from escape_hw.runtime.session.record import BenchRecord
 from escape_hw.runtime.session.system import System
 from escape_sim.stand_ins import bench_server
 from escape_sim.stand_ins.bench_server import RequestKind, StandInBenchServer
@@ -53,6 +54,9 @@ def test_real_drivers_calibrate_and_close_the_loop_as_the_twins_devices_do(serve
     for mode in ("hardware", "sim"):
         with system(mode) as bench:
             assert bench.simulated, "behind a stand-in there is no metal"
+            assert BenchRecord.from_bench(bench).injected is not None, (
+                "[twin] applies through drivers as well"
+            )
             found = bench.calibrate("docrime", frames=300)
             run = bench.close_loop(found.matrix, found.grid, frames=60)
             results[mode] = found.matrix.data, bench.wfs.status(), run

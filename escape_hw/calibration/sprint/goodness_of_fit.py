@@ -38,6 +38,8 @@ _NORMAL_RATIO = 1.4826
 #: Norm of the fitted matrix in standard errors below which the sensor does not see the mirror: the largest of
 #: some hundred starts of a search in pure noise reaches about 5.
 _MIN_SIGNIFICANCE = 10.0
+#: One pattern of slopes with a larger fraction of the matrix is not the response to so many modes or more.
+_MAX_PATTERN, _MIN_MODES = 0.5, 5
 #: Largest scaling in % and rotation in degrees: the search covers half of them.
 _MAX_SCALING, _MAX_ROTATION = 20.0, 30.0
 #: Sub-apertures or actuators with an outlying residual that are named at most.
@@ -83,6 +85,12 @@ class Misfit:
     def matters(self) -> bool:
         """Whether it is significant, larger than the noise is uncertain, and no small part of the matrix."""
         return self.fraction > _TOLERATED_MISFIT and self.excess > _TOLERATED_EXCESS
+
+
+def strongest_pattern_fraction(data: NDArray[np.float64]) -> float:
+    """Fraction of a matrix's sum of squares that is one pattern of slopes times a number per column."""
+    powers = np.linalg.eigvalsh(data.T @ data)
+    return float(powers[-1] / powers.sum())
 
 
 def _error_of_mean(square: NDArray[np.float64]) -> float:
@@ -191,14 +199,9 @@ def check_fit(
     misfit, fitted = Misfit.of(weighted, residual).fraction, weighted.data - residual
     significance = float(np.linalg.norm(fitted)) / weighted.noise_level(residual)
     if explained < MIN_EXPLAINED_FRACTION * signal or np.vdot(fitted, weighted.data) <= 0:
-        hint = check_orientation(matrix, model, columns)
-        if hint is None and signal < MIN_EXPLAINED_FRACTION:
-            hint = (
-                "the matrix is hardly above its noise: does the mirror move, and is its light on the sensor?"
-            )
         reasons.append(
             f"the model explains {max(explained, 0.0):.0%} of the matrix where noise leaves {signal:.0%} "
-            f"to explain; {hint or 'wrong layout, flip or basis, or a registration beyond capture'}"
+            f"to explain; {_probable_cause(matrix, model, columns, weighted)}"
         )
     elif significance < _MIN_SIGNIFICANCE:
         reasons.append(
@@ -218,6 +221,24 @@ def check_fit(
             f"chi-squared {weighted.reduced_chi_squared(residual):.3g}); {where}"
         )
     return reasons + _implausible_values(registration)
+
+
+def _probable_cause(
+    matrix: InteractionMatrix, model: SyntheticModel, columns: NDArray[np.intp], weighted: WeightedMatrix
+) -> str:
+    """Why a model explains next to nothing of a matrix, for the message."""
+    hint = check_orientation(matrix, model, columns)
+    if hint is not None:
+        return hint
+    pattern = strongest_pattern_fraction(weighted.data)
+    if weighted.data.shape[1] >= _MIN_MODES and pattern > _MAX_PATTERN:
+        return (
+            f"{pattern:.0%} of the matrix are one pattern of slopes, whatever the command: does the mirror "
+            "move, or did the slopes change by themselves?"
+        )
+    if weighted.signal_fraction < MIN_EXPLAINED_FRACTION:
+        return "the matrix is hardly above its noise: does the mirror move, and is its light on the sensor?"
+    return "wrong layout, flip or basis, or a registration beyond capture"
 
 
 def _implausible_values(registration: Registration) -> list[str]:
