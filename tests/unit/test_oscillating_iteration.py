@@ -55,6 +55,9 @@ class Overshooting:
         alpha = np.where(np.abs(state.alpha) < self.at_least, nearest, state.alpha)
         return System(alpha, self.too_far, np.full((4, 3), 100.0))
 
+    def extrapolate_residual(self, state):
+        return np.full((4, 3), 100.0)
+
     def move(self, state, step):
         return replace(state, alpha=state.alpha + step[1:6])
 

@@ -271,8 +271,8 @@ def fit_registration(
         _require_fittable(matrix, model, columns)
         weighted = apply_model_weights(WeightedMatrix.from_columns(matrix, columns), model)
     context = SolverContext(
-        matrix, model, columns, solver, learning_rate, max_iterations, priors or usual_priors, usual_priors,
-        build_extra_parameters(model, extra_parameters),
+        matrix, model, columns, solver, learning_rate, max_iterations, priors or usual_priors,
+        build_extra_parameters(model, extra_parameters), usual_priors,
     )  # fmt: skip
     weighted, solution = yield from _in_one_thread(
         _solve_with_updates(context, weighted, initial.to_array(), coarse_search, update_priors, loss, state)

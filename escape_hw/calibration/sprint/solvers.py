@@ -69,8 +69,8 @@ class SolverContext:
     learning_rate: float
     max_iterations: int
     priors: Priors
-    usual_priors: Priors
     extras: tuple[ExtraParameterModel, ...] = ()
+    usual_priors: Priors = field(default_factory=Priors)
     history: list[SprintIteration] = field(default_factory=list)
     report: Reporter = field(init=False)
     problem: MixedEffectsProblem | None = field(init=False, default=None)
