@@ -8,9 +8,10 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from escape_hw.config.system import TelescopeSection
-from escape_hw.pipeline.geometry.obscuration import build_shadow, fit_shadow_offset, transmitted_fraction
+from escape_hw.pipeline.geometry.obscuration import build_shadow, transmitted_fraction
 from escape_hw.pipeline.geometry.pupil_images import find_pupil_images, refine_pupil_images
 from escape_hw.pipeline.geometry.pupil_rims import estimate_roundness_error
+from escape_hw.pipeline.geometry.shadow_fit import fit_shadow_offset
 
 N, SHAPE = 30, (80, 80)
 NOMINAL = np.array([[19.5, 19.5], [59.5, 19.5], [19.5, 59.5], [59.5, 59.5]])
