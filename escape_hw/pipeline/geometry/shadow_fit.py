@@ -15,7 +15,7 @@ from escape_hw.pipeline.geometry.pupil_rims import RIM_SOFTNESS
 #: Share of the radius in which the shadow is fitted: away from the rim, where contamination collects.
 _FIT_RADIUS = 0.6
 #: Larger images are binned: the time of a fit increases with the sixth power of the diameter.
-_MAX_DIAMETER_PX = 32.0
+_MAX_DIAMETER_PX = 40.0
 #: Number of iterations, and largest step of each in pixels.
 _ITERATIONS, _MAX_STEP = 3, 0.7
 #: Samples across a pixel of the shadow map (odd).
