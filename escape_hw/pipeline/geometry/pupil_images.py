@@ -109,9 +109,9 @@ def refine_pupil_images(
     """Refit centres, diameter and flux on the mean of a long run, and estimate the error of the mean centre.
 
     Under turbulence the rims fitted on a second of frames may be off by some tenths of a pixel. Boxes and
-    mask stay the same, and with them the slopes; the centres are for the synthetic model. Contamination of the
-    edge moves the rims of all four images alike, and by an error that they do not show. So on a telescope the
-    rims only give the diameter and the relative positions, and the shadow of the secondary mirror the mean one.
+    mask stay the same, and with them the slopes; the centres are for the synthetic model. Contamination of
+    the edge moves the rims of all four images alike, by an error that they do not show. So on a telescope the
+    rims give the diameter and the relative positions only, and the shadow of the secondary mirror the mean.
 
     Parameters
     ----------

@@ -22,8 +22,9 @@ _ITERATIONS, _MAX_STEP = 3, 0.7
 _OVERSAMPLING = 21
 #: Relative change of the softness for which the change of the shadow is computed.
 _SOFTNESS_CHANGE = 0.1
-#: Evaluations and tolerances (parameters, log likelihood) of the search for the unevenness.
-_SEARCH = {"maxfev": 120, "xatol": 0.1, "fatol": 0.2}
+#: Evaluations and tolerances (parameters, log likelihood) of the search for the unevenness: a likelihood that
+#: changes by less than a factor of e is not significant.
+_SEARCH = {"maxfev": 120, "xatol": 0.3, "fatol": 1.0}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -113,7 +114,7 @@ def _fit_offset(
 
 def _select_pixels(image: NDArray[np.float64], centres: NDArray[np.float64], diameter: float) -> _Pixels:
     """Pixels around the shadow."""
-    rows, columns = np.indices(image.shape)
+    columns, rows = np.meshgrid(*(np.arange(length) for length in image.shape[::-1]))
     parts = []
     for number, (cx, cy) in enumerate(centres):
         inside = np.hypot(columns - cx, rows - cy) < _FIT_RADIUS * diameter / 2
