@@ -131,8 +131,7 @@ def test_large_images_are_binned() -> None:
     assert shadow is not None
     small, sigma = fit_shadow_offset(image[::2, ::2], NOMINAL, N, shadow)
     large, sigma_large = fit_shadow_offset(image, 2 * NOMINAL + 0.5, 2 * N, shadow)
-    # The images' edges are assumed to be half as soft at first.
-    assert large == pytest.approx(2 * small, abs=2 * sigma)
+    assert large == pytest.approx(2 * small, abs=sigma)
     assert sigma_large == pytest.approx(2 * sigma, rel=0.3)
 
 

@@ -17,11 +17,13 @@ _FIT_RADIUS = 0.6
 #: Larger images are binned: the time of a fit increases with the sixth power of the diameter.
 _MAX_DIAMETER_PX = 40.0
 #: Number of iterations, and largest step of each in pixels.
-_ITERATIONS, _MAX_STEP = 3, 0.7
+_ITERATIONS, _MAX_STEP = 4, 0.7
 #: Samples across a pixel of the shadow map (odd).
 _OVERSAMPLING = 21
 #: Relative change of the softness for which the change of the shadow is computed.
 _SOFTNESS_CHANGE = 0.1
+#: Scales of the unevenness to start from, see :class:`_Unevenness`.
+_START = np.log([1.0, 2.0, 1.0, 2.0])
 #: Evaluations and tolerances (parameters, log likelihood) of the search for the unevenness: a likelihood that
 #: changes by less than a factor of e is not significant.
 _SEARCH = {"maxfev": 120, "xatol": 0.3, "fatol": 1.0}
@@ -100,15 +102,17 @@ def _fit_offset(
     shadow: Shadow,
     softness: float,
 ) -> tuple[NDArray[np.float64], float]:
-    pixels, shadow_map = _select_pixels(image, centres, diameter), _shadow_map(shadow, diameter, softness)
-    model = _linearise(pixels, shadow_map, np.zeros(2))
-    unevenness = _Unevenness(pixels)
-    scales = unevenness.find_scales(model)
+    pixels = _select_pixels(image, centres, diameter)
+    unevenness, scales = _Unevenness(pixels), _START
     offset, covariance = np.zeros(2), np.zeros((2, 2))
-    for _ in range(_ITERATIONS):
-        step, covariance = unevenness.fit(model, scales)
+    for iteration in range(_ITERATIONS):
+        model = _linearise(pixels, _shadow_map(shadow, diameter, softness), offset)
+        if iteration == _ITERATIONS // 2:
+            # What the wrong offset and softness leave would otherwise count as unevenness.
+            scales = unevenness.find_scales(model)
+        change, step, covariance = unevenness.fit(model, scales)
         offset = offset + np.clip(step, -_MAX_STEP, _MAX_STEP)
-        model = _linearise(pixels, shadow_map, offset)
+        softness *= float(np.clip(1 + _SOFTNESS_CHANGE * change, 0.7, 1.4))
     return offset, float(np.sqrt(np.trace(covariance) / 2))
 
 
@@ -175,21 +179,20 @@ class _Unevenness:
         # Half a second, which a Shack-Hartmann sensor need not wait for.
         from scipy import optimize
 
-        start = np.log([1.0, 2.0, 1.0, 2.0])
         limits = np.log([(1e-3, 1e3), (0.5, 50.0)] * 2)
-        simplex = np.vstack([start, start + 0.7 * np.eye(4)])
+        simplex = np.vstack([_START, _START + 0.7 * np.eye(4)])
         found = optimize.minimize(
-            lambda scales: self._solve(model, scales)[2], start, method="Nelder-Mead", bounds=limits,
+            lambda scales: self._solve(model, scales)[2], _START, method="Nelder-Mead", bounds=limits,
             options={**_SEARCH, "initial_simplex": simplex},
         )  # fmt: skip
         return np.asarray(found.x)
 
     def fit(
         self, model: _LinearModel, scales: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Generalised least squares: offset ``(2,)`` and its covariance ``(2, 2)``."""
+    ) -> tuple[float, NDArray[np.float64], NDArray[np.float64]]:
+        """Generalised least squares: softness, offset ``(2,)``, and covariance ``(2, 2)`` of the offset."""
         solution, covariance, _ = self._solve(model, scales)
-        return solution[-2:], covariance[-2:, -2:]
+        return float(solution[-3]), solution[-2:], covariance[-2:, -2:]
 
     def _solve(
         self, model: _LinearModel, scales: NDArray[np.float64]
