@@ -11,13 +11,14 @@ from numpy.typing import NDArray
 from escape_hw.api.concurrency import limit_to_one_thread
 from escape_hw.api.pyramid import IMAGES, PyramidPupils, pupil_boxes, remove_low_orders
 from escape_hw.errors import CalibrationError
-from escape_hw.pipeline.geometry.obscuration import Shadow, fit_shadow_offset
+from escape_hw.pipeline.geometry.obscuration import Shadow
 from escape_hw.pipeline.geometry.pupil_rims import (
     ITERATIONS,
     MAX_HARMONIC,
     estimate_roundness_error,
     fit_rims,
 )
+from escape_hw.pipeline.geometry.shadow_fit import fit_shadow_offset
 from escape_hw.pipeline.slopes.pyramid import slopes_of_image
 
 #: Largest distance of an image from its nominal position, in diameters.
@@ -30,11 +31,6 @@ _MIN_LIGHT_FRACTION = 0.1
 #: telescopes is small enough to make the rim of a vignetted edge as steep as any other; on a bench, whose
 #: stop is clean, compression would emphasise the light that diffraction scatters between the images.
 _COMPRESSION, _COMPRESSION_VIGNETTED = 1.0, 0.25
-#: Ratio of the first harmonic of a vignetted rim, which is taken for a shift, to the second to fourth ones.
-_FIRST_HARMONIC = 1.4
-#: Errors in pixels of the shadow beyond its scatter over time, because the light is uneven on its scale, and
-#: of rim and shadow together (docs/decisions/0018-pyramid-registration-uncertainties.md).
-_SHADOW_SIGMA_PX, _COMMON_SIGMA_PX = 0.02, 0.018
 #: Fewest lit pixels of an image.
 _MIN_VALID = 12
 
@@ -113,15 +109,15 @@ def refine_pupil_images(
     """Refit centres, diameter and flux on the mean of a long run, and estimate the error of the mean centre.
 
     Under turbulence the rims fitted on a second of frames may be off by some tenths of a pixel. Boxes and
-    mask stay the same, and with them the slopes; the centres are for the synthetic model. Vignetting at the
-    edge affects the rims of all four images, but not the shadow of the secondary; the two are weighted by
-    their errors.
+    mask stay the same, and with them the slopes; the centres are for the synthetic model. Contamination of
+    the edge moves the rims of all four images alike, by an error that they do not show. So on a telescope the
+    rims give the diameter and the relative positions only, and the shadow of the secondary mirror the mean.
 
     Parameters
     ----------
     means
         Means of equally many frames in counts ``(rows, columns)``, background subtracted, in order of time.
-        Their scatter gives the error.
+        Without a shadow their scatter is part of the error.
     shadow
         Transmission of the telescope's obscuration and vanes; ``None`` without them.
     """
@@ -137,43 +133,30 @@ def _refine(
     compression, order = (_COMPRESSION, 1) if shadow is None else (_COMPRESSION_VIGNETTED, MAX_HARMONIC)
     image = np.asarray(np.mean(means, axis=0), np.float64)
     centres, diameter = _fit_centres(image, pupils.centres_px, n_sub, compression, order)
-    compressed = _compress_bright(image, compression)
-    variance = estimate_roundness_error(compressed, centres, diameter / 2, n_sub / 2) ** 2
-    if shadow is not None:
-        variance *= _FIRST_HARMONIC**2
-    if len(means) > 1:
-        parts = [
-            _fit_centres(np.asarray(part, np.float64), centres, n_sub, compression, order)[0].mean(axis=0)
-            for part in means
-        ]
-        variance += float(np.mean(np.var(parts, axis=0, ddof=1))) / len(parts)
-    if shadow is not None:
-        offset, shadow_variance = _offset_from_shadow(means, image, centres, diameter, shadow)
-        share = variance / (variance + shadow_variance)
-        centres, variance = centres + share * offset, variance * (1 - share) + _COMMON_SIGMA_PX**2
+    if shadow is None:
+        sigma = _rim_sigma(means, image, centres, diameter, n_sub)
+    else:
+        offset, sigma = fit_shadow_offset(image, centres, diameter, shadow)
+        centres = centres + offset
     light = _summed_light(image, pupils.corners_px, n_sub)
     flux = np.maximum(light / np.percentile(light[pupils.valid], 95), 0.0).astype(np.float32)
-    return replace(
-        pupils, centres_px=centres, diameter_px=diameter, centre_sigma_px=float(np.sqrt(variance)), flux=flux
-    )
+    return replace(pupils, centres_px=centres, diameter_px=diameter, centre_sigma_px=sigma, flux=flux)
 
 
-def _offset_from_shadow(
+def _rim_sigma(
     means: Sequence[NDArray[np.float32]],
     image: NDArray[np.float64],
     centres: NDArray[np.float64],
     diameter: float,
-    shadow: Shadow,
-) -> tuple[NDArray[np.float64], float]:
-    """Offset of the shadow from the centres ``(2,)``, and its variance along an axis."""
-    offset, sigma = fit_shadow_offset(image, centres, diameter, shadow)
-    variance = sigma**2
+    n_sub: int,
+) -> float:
+    """Standard error of the mean of the centres along an axis: roundness of the rims, scatter over time."""
+    compressed = _compress_bright(image, _COMPRESSION)
+    variance = estimate_roundness_error(compressed, centres, diameter / 2, n_sub / 2) ** 2
     if len(means) > 1:
-        parts = [
-            fit_shadow_offset(np.asarray(part, np.float64), centres, diameter, shadow)[0] for part in means
-        ]
-        variance = float(np.mean(np.var(parts, axis=0, ddof=1))) / len(parts)
-    return offset, variance + _SHADOW_SIGMA_PX**2
+        parts = [_fit_centres(np.asarray(part, np.float64), centres, n_sub)[0].mean(axis=0) for part in means]
+        variance += float(np.mean(np.var(parts, axis=0, ddof=1))) / len(parts)
+    return float(np.sqrt(variance))
 
 
 def _summed_light(image: NDArray[np.float64], corners: NDArray[np.intp], n_sub: int) -> NDArray[np.float64]:
