@@ -68,6 +68,12 @@ CASES = {
     "vis-1500": Case("as bundled, 1,500 frames", "maps-vis", 1500),
 }  # fmt: skip
 
+#: Limits of the rms errors that the page claims: shift, rotation, scaling; and of what a matrix leaves, in %.
+LIMITS = {
+    "dm97-1000": (0.5, 0.02, 0.2), "dm97-50": (1.0, 0.04, 0.3), "dm97-1500": (4.0, 0.05, 0.4),
+}  # fmt: skip
+MATRIX_LIMIT = 8.0
+
 
 def table_path(folder: Path, name: str) -> Path:
     """The raw table of a case."""
