@@ -82,6 +82,25 @@ def test_the_hosted_run_is_the_local_one() -> None:
     assert steps == ["sudo python3 tests/system_packages.py --install", ".ci/run"]
 
 
+#: Marks of tests that continuous integration does not run, and why; CONTRIBUTING.md says when they are run.
+NOT_IN_CI = {
+    "campaign": "the campaigns take longer than the hour that continuous integration has",
+    "screenshots": "they test nothing: they make the pictures of the documentation",
+    "hardware": "they need a device",
+}
+
+
+def test_continuous_integration_runs_every_test_or_says_why_not() -> None:
+    options = tomllib.loads(text("pyproject.toml"))["tool"]["pytest"]["ini_options"]
+    marks = {line.partition(":")[0] for line in options["markers"]}
+    left_out = set(re.findall(r"not (\w+)", options["addopts"]))
+    run = set(re.findall(r'^"\$\{bare\[@\]\}" make test ARGS="-m (\w+)"$', text(".ci/run"), re.MULTILINE))
+    assert left_out - run == set(NOT_IN_CI), "a mark that is neither run nor excluded with a reason"
+    assert marks >= left_out >= run
+    for mark in NOT_IN_CI:
+        assert f"`{mark}`" in text("CONTRIBUTING.md")
+
+
 @pytest.mark.parametrize("name", ["CONTRIBUTING.md", "SECURITY.md", "CHANGELOG.md"])
 def test_links_of_the_files_beside_the_readme(name: str) -> None:
     for target in re.findall(r"\]\(([^)#]+)[^)]*\)", text(name)):
