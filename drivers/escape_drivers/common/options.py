@@ -28,8 +28,8 @@ def _round(*rows: int) -> str:
 
 
 #: Layouts by the number of actuators: adaptive secondaries, and ALPAO's mirrors that are no ``circle-N``. The
-#: rows of these are in ``alpao_dms_data/configuration.ini`` of the public repository ArcetriAdaptiveOptics/ekarus
-#: (commit 24c67bac), those of 277 actuators also in REVOLT's public configuration.
+#: rows of these are in ``alpao_dms_data/configuration.ini`` of the public repository ekarus of
+#: ArcetriAdaptiveOptics (commit 24c67bac), those of 277 actuators also in REVOLT's public configuration.
 _KNOWN_LAYOUTS = {
     336: "maps-336",
     672: "rings-672",
