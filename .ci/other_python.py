@@ -1,7 +1,7 @@
-"""Print a second Python for the tests: the newest of 3.11 to 3.13 that works and is of another release.
+"""Print a second Python for the tests: the newest of 3.13, 3.12 and 3.11 that works and is not this one.
 
 Looks along ``PATH`` and in the folders beside the installation of the Python that runs this, where several
-are often kept side by side. Prints nothing if there is none.
+are often kept side by side. Prints an empty line if there is none.
 """
 
 import os
@@ -31,6 +31,11 @@ def works(python: Path, minor: int) -> bool:
     return done.stdout.split() == ["3", str(minor)]
 
 
-minors = [minor for minor in (13, 12, 11) if minor != sys.version_info[1]]
-found = (python for minor in minors for python in candidates(minor) if works(python, minor))
-print(next(found, ""))
+def find(minor: int) -> str:
+    """A Python 3 of this minor release that works; empty if there is none."""
+    return str(next((python for python in candidates(minor) if works(python, minor)), ""))
+
+
+if __name__ == "__main__":
+    others = (find(minor) for minor in (13, 12, 11) if minor != sys.version_info[1])
+    print(next(filter(None, others), ""))

@@ -16,6 +16,8 @@ from packaging.utils import canonicalize_name
 import escape_hw
 
 ROOT = Path(__file__).resolve().parents[2]
+#: Extras of what optional tests need.
+ALL = ("all", "interchange", "interchange-pyrtc", "dask", "postgresql")
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
 
 
@@ -43,7 +45,7 @@ def test_tested_versions_satisfy_every_requirement() -> None:
     extras = PROJECT["optional-dependencies"]
     wanted = [
         *PROJECT["dependencies"],
-        *(one for name in ("gui", "sweep", "test", "docs", "dev") for one in extras[name]),
+        *(one for name in ("gui", "sweep", "test", "docs", "dev", *ALL) for one in extras[name]),
     ]
     for requirement in map(Requirement, wanted):
         if requirement.name != PROJECT["name"]:
