@@ -9,6 +9,9 @@ FIND = for p in python3.13 python3.12 python3.11 python3; do \
 PYTHON ?= $(shell $(FIND))
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet
 
+# Environment of a second Python: make test VENV=.venv-other PYTHON=python3.13
+OTHER := .venv-other
+
 # The oldest versions are installed beside the newest, on the oldest Python, for which they have wheels.
 FLOOR := .venv-floor
 FLOOR_PYTHON ?= python3.11
@@ -19,7 +22,7 @@ ONE_THREAD := OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 NUMBA_N
 # A file of tests stays in one process, which makes what its tests share; the folders with long files come first.
 WORKERS := -n 2 --dist loadfile --no-loadscope-reorder
 
-.PHONY: help run test test-all floor check docs perf clean
+.PHONY: help run test test-all floor check docs perf clean python
 
 help: ## List the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*##/\t/'
@@ -56,7 +59,10 @@ perf: $(VENV)/bench.stamp ## Measure speed against OOPAO and pyRTC
 	$(BIN)/escape perf $(ARGS)
 
 clean: ## Remove the environment and caches
-	rm -rf $(VENV) $(FLOOR) .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+	rm -rf $(VENV) $(OTHER) $(FLOOR) .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+
+python: # Say which Python the environment is made with
+	@test -n "$(PYTHON)" && echo "$(PYTHON)"
 
 $(BIN)/python:
 	@test -n "$(PYTHON)" || { echo "No Python 3.11 or newer with venv found; set PYTHON=..." >&2; exit 1; }

@@ -14,7 +14,11 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable
+from ctypes.util import find_library
+from importlib.util import find_spec
 from pathlib import Path
+
+SHARED = Path(os.environ.get("ESCAPE_SHARED_DATA", Path(__file__).parents[2] / "shared" / "data"))
 
 
 def can_load(*names: str) -> bool:
@@ -60,7 +64,31 @@ NEEDED: tuple[tuple[str, Callable[[], object], tuple[str, ...]], ...] = (
         lambda: shutil.which("Xvfb") and can_load(*X11),
         X11_PACKAGES,
     ),
+    ("Chromium, for reports in a browser", lambda: shutil.which("chromium"), ("chromium",)),
     ("setpriv, to run commands as another user", lambda: shutil.which("setpriv"), ("util-linux",)),
+)
+#: What tests use where it is and nothing here installs, how to look for it, and why.
+NOT_INSTALLED: tuple[tuple[str, Callable[[], object], str], ...] = (
+    (
+        "milk's ImageStreamIO",
+        lambda: os.environ.get("ESCAPE_IMAGESTREAMIO_LIBRARY") or find_library("ImageStreamIO"),
+        "Debian and PyPI have no package of it (docs/interchange.md)",
+    ),
+    (
+        "PI's client PIPython",
+        lambda: find_spec("pipython"),
+        "its licence allows use with PI's products only: pip install '.[pi-client]'",
+    ),
+    (
+        "XIMEA's wrapper ximea-py",
+        lambda: find_spec("ximea"),
+        "it comes without a licence: pip install '.[ximea-client]'",
+    ),
+    (
+        "matrices of real instruments",
+        lambda: SHARED.is_dir(),
+        "they are not part of this repository: ESCAPE_SHARED_DATA names their folder (CONTRIBUTING.md)",
+    ),
 )
 
 
@@ -93,6 +121,9 @@ def main() -> None:
     if "--window" in sys.argv[1:]:
         check_window()
         return
+    for what, is_there, reason in NOT_INSTALLED:
+        if not is_there():
+            print(f"missing, and not installed here: {what}; {reason}")
     missing = [(what, packages) for what, is_there, packages in NEEDED if not is_there()]
     names = [name for _, packages in missing for name in packages]
     for what, packages in missing:

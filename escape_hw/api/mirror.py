@@ -16,7 +16,7 @@ from escape_hw.api.representation import short_repr
 from escape_hw.deprecation import renamed_members
 from escape_hw.errors import CommandRejected, DeviceError, SettingRejected
 from escape_hw.safety.guard import CommandGuard, GuardReport
-from escape_hw.safety.limits import MirrorLimits, nearest_pairs, neighbour_pairs
+from escape_hw.safety.limits import MirrorLimits, all_pairs, nearest_pairs, neighbour_pairs
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -30,7 +30,8 @@ class DMInfo:
         ``None`` if the actuators are not on a grid.
     positions_m
         Actuator positions ``(n_act, 2)`` as (x, y) in metres on the mirror, from its centre; x increases
-        along the columns of the layout, y along its rows.
+        along the columns of the layout, y along its rows. All NaN where the arrangement is not known: the
+        guard then takes any two actuators for neighbours.
     stroke_m
         Metres of surface at the actuator for a command of 1; NaN if it is not known.
     """
@@ -239,8 +240,7 @@ class DeformableMirror(Device):
                 self.name, f"its layout has {int(info.layout.sum())} positions for {info.n_act} actuators"
             )
         try:
-            pairs = nearest_pairs(info.positions_m) if info.layout is None else neighbour_pairs(info.layout)
-            guard = CommandGuard(self.name, info.n_act, self.limits, pairs)
+            guard = CommandGuard(self.name, info.n_act, self.limits, _pairs_of(info))
         except ValueError as error:
             raise SettingRejected(self.name, f"its limits do not fit: {error}") from error
         present = self._present_shape()
@@ -272,3 +272,12 @@ class DeformableMirror(Device):
             ``None``: the command was accepted. A mirror that skipped it returns the shape that it kept,
             read-only.
         """
+
+
+def _pairs_of(info: DMInfo) -> NDArray[np.intp]:
+    """Pairs of neighbours ``(n_pairs, 2)`` for the guard; all pairs where the arrangement is not known."""
+    if info.layout is not None:
+        return neighbour_pairs(info.layout)
+    if np.isnan(info.positions_m).all():
+        return all_pairs(info.n_act)
+    return nearest_pairs(info.positions_m)

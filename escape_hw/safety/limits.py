@@ -97,6 +97,11 @@ def neighbour_pairs(layout: NDArray[np.bool_]) -> NDArray[np.intp]:
     return np.concatenate(pairs)
 
 
+def all_pairs(n_act: int) -> NDArray[np.intp]:
+    """Every pair of actuators once ``(n_pairs, 2)``: the neighbours where the arrangement is not known."""
+    return np.stack(np.triu_indices(n_act, 1), axis=1)
+
+
 def nearest_pairs(positions: NDArray[np.float64]) -> NDArray[np.intp]:
     """Pairs of adjacent actuators, up to 1.3 median distances to the nearest actuator apart.
 

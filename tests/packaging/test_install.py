@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import runpy
 import subprocess
 import sys
 import tarfile
@@ -16,7 +17,7 @@ import escape_hw
 
 ROOT = Path(__file__).resolve().parents[2]
 
-pytestmark = [pytest.mark.campaign, pytest.mark.timeout(1200)]
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(1200)]
 
 
 def run(*command: str, cwd: Path) -> str:
@@ -43,18 +44,37 @@ def names(wheel: Path) -> set[str]:
         return set(archive.namelist())
 
 
-def test_the_source_distribution_installs_into_an_empty_environment(tmp_path: Path) -> None:
-    source = build("sdist", ROOT, tmp_path / "sdist")
-    with tarfile.open(source) as archive:
-        archive.extractall(tmp_path / "unpacked", filter="data")
-    (unpacked,) = (tmp_path / "unpacked").iterdir()
+@pytest.fixture(scope="module")
+def unpacked(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of the unpacked source distribution."""
+    folder = tmp_path_factory.mktemp("source")
+    with tarfile.open(build("sdist", ROOT, folder / "sdist")) as archive:
+        archive.extractall(folder / "unpacked", filter="data")
+    (found,) = (folder / "unpacked").iterdir()
+    return found
+
+
+@pytest.fixture(scope="module")
+def wheel(unpacked: Path) -> Path:
+    """Wheel built from the source distribution."""
+    return build("wheel", unpacked, unpacked.parent / "wheel")
+
+
+def test_the_source_distribution_is_complete(unpacked: Path, wheel: Path, tmp_path: Path) -> None:
     assert unpacked.name == f"escape_hw-{escape_hw.__version__}"
     for name in ("CHANGELOG.md", "LICENSE", "constraints.txt", "tests/conftest.py", "docs/index.md"):
         assert (unpacked / name).is_file(), name
-    wheel = build("wheel", unpacked, tmp_path / "wheel")
     assert names(wheel) == names(build("wheel", ROOT, tmp_path / "checkout"))
 
-    run(sys.executable, "-m", "venv", str(tmp_path / "venv"), cwd=tmp_path)
+
+@pytest.mark.parametrize("minor", [11, 12, 13])
+def test_the_wheel_installs_into_an_empty_environment(
+    minor: int, unpacked: Path, wheel: Path, tmp_path: Path
+) -> None:
+    python = runpy.run_path(str(ROOT / ".ci" / "other_python.py"))["find"](minor)
+    if not python:
+        pytest.skip(f"no Python 3.{minor} with venv found")
+    run(python, "-m", "venv", str(tmp_path / "venv"), cwd=tmp_path)
     programs = tmp_path / "venv" / "bin"
     pip = (str(programs / "python"), "-m", "pip", "--disable-pip-version-check", "install", "--quiet")
     run(*pip, "--constraint", str(unpacked / "constraints.txt"), str(wheel), cwd=tmp_path)

@@ -16,6 +16,8 @@ from packaging.utils import canonicalize_name
 import escape_hw
 
 ROOT = Path(__file__).resolve().parents[2]
+#: Extras of what optional tests need.
+ALL = ("all", "interchange", "interchange-pyrtc", "dask", "postgresql")
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
 
 
@@ -43,7 +45,7 @@ def test_tested_versions_satisfy_every_requirement() -> None:
     extras = PROJECT["optional-dependencies"]
     wanted = [
         *PROJECT["dependencies"],
-        *(one for name in ("gui", "sweep", "test", "docs", "dev") for one in extras[name]),
+        *(one for name in ("gui", "sweep", "test", "docs", "dev", *ALL) for one in extras[name]),
     ]
     for requirement in map(Requirement, wanted):
         if requirement.name != PROJECT["name"]:
@@ -79,7 +81,26 @@ def test_the_desktop_entry_starts_the_window() -> None:
 
 def test_the_hosted_run_is_the_local_one() -> None:
     steps = re.findall(r"^ +- run: (.*)$", text(".github/workflows/ci.yml"), re.MULTILINE)
-    assert steps == [".ci/run"]
+    assert steps == ["sudo python3 tests/system_packages.py --install", ".ci/run"]
+
+
+#: Marks of tests that continuous integration does not run, and why; CONTRIBUTING.md says when they are run.
+NOT_IN_CI = {
+    "campaign": "the campaigns take longer than the hour that continuous integration has",
+    "screenshots": "they test nothing: they make the pictures of the documentation",
+    "hardware": "they need a device",
+}
+
+
+def test_continuous_integration_runs_every_test_or_says_why_not() -> None:
+    options = tomllib.loads(text("pyproject.toml"))["tool"]["pytest"]["ini_options"]
+    marks = {line.partition(":")[0] for line in options["markers"]}
+    left_out = set(re.findall(r"not (\w+)", options["addopts"]))
+    run = set(re.findall(r'^"\$\{bare\[@\]\}" make test ARGS="-m (\w+)"$', text(".ci/run"), re.MULTILINE))
+    assert left_out - run == set(NOT_IN_CI), "a mark that is neither run nor excluded with a reason"
+    assert marks >= left_out >= run
+    for mark in NOT_IN_CI:
+        assert f"`{mark}`" in text("CONTRIBUTING.md")
 
 
 @pytest.mark.parametrize("name", ["CONTRIBUTING.md", "SECURITY.md", "CHANGELOG.md"])

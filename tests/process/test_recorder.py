@@ -11,6 +11,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -48,16 +49,23 @@ def entries(writer: RingWriter, first: int, count: int, *, size: int = 100, wait
             time.sleep(wait_s)
 
 
-def recorded(tmp_path, writer, produce, **options):
-    """Record in a thread while ``produce`` runs."""
+@contextmanager
+def recording(tmp_path, writer, **options):
+    """A recorder that runs in a thread until the end of the block."""
     stop = threading.Event()
     recorder = StreamRecorder(tmp_path, {"slopes": writer.name}, **options)
     thread = threading.Thread(target=recorder.run, args=(stop.is_set,))
     thread.start()
-    produce()
+    yield recorder
     stop.set()
     thread.join(30)
     assert not thread.is_alive()
+
+
+def recorded(tmp_path, writer, produce, **options):
+    """Record in a thread while ``produce`` runs."""
+    with recording(tmp_path, writer, **options) as recorder:
+        produce()
     return recorder.state
 
 
@@ -110,14 +118,12 @@ def test_memory_is_bounded_when_the_disk_stands_still(tmp_path, writer, monkeypa
     monkeypatch.setattr(module, "_BLOCK_BYTES", 4000)
     monkeypatch.setattr(module, "MAX_QUEUED_BYTES", 20_000)
 
-    def produce():
+    with recording(tmp_path, writer) as recorder:
         entries(writer, 0, 800, wait_s=0.0002)
-        time.sleep(0.3)
+        # Five blocks of ten entries wait at most, and none of the others stopped the writer.
+        _until(lambda: recorder.state.dropped >= 700)
         going_on.set()
-
-    state = recorded(tmp_path, writer, produce)
-    # Five blocks of ten entries wait at most, and none of the others stopped the writer.
-    assert state.dropped >= 700
+    state = recorder.state
     assert state.written + state.dropped == 800
     assert state.fault == ""
 
@@ -143,8 +149,9 @@ def test_a_full_disk_ends_the_recording_and_leaves_whole_blocks(tmp_path, writer
 
 
 def test_room_is_left_to_others(tmp_path, writer):
-    state = recorded(tmp_path, writer, lambda: time.sleep(0.2), min_free_bytes=1 << 60)
-    assert "below the limit of" in state.fault
+    with recording(tmp_path, writer, min_free_bytes=1 << 60) as recorder:
+        _until(lambda: recorder.state.fault)
+    assert "below the limit of" in recorder.state.fault
 
 
 class SmallDisk(io.FileIO):

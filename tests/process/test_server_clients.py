@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import time
 import uuid
 from collections.abc import Iterator
 from contextlib import ExitStack
@@ -73,9 +72,9 @@ def test_a_client_that_floods_and_never_reads_stops_nothing(
                 request = json.dumps(document).encode()
                 for _ in range(5_000):
                     raw.send_multipart([b"2", request])
-            # Others are served meanwhile.
-            assert bench.plan("docrime", {"frames": 500}).frames == 500
-            time.sleep(1)
+            # Others are served meanwhile, between requests of those that do not read.
+            for _ in range(50):
+                assert bench.plan("docrime", {"frames": 500}).frames == 500
         # A connection that failed is found by a timer.
         wait_for(lambda: memory(front) - before < 100e6, "what waited for the clients is dropped")
     assert bench.connected

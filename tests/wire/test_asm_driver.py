@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import logging
+import subprocess
+import sys
+import threading
 import time
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
-from asm_bench import as_driver, driver, emulator, port_of, wait_for
+from asm_bench import PATIENCE_S, as_driver, driver, emulator, port_of, wait_for
 
 from escape_drivers.asm import messages as m
 from escape_drivers.asm.codec import AsmCodec
@@ -19,25 +24,23 @@ from escape_hw.api.adaptive_secondary import ShellState
 from escape_hw.config.loader import load_system
 from escape_hw.errors import ConfigError, DeviceError, FrameTimeout, SettingRejected
 from escape_hw.testing import Check, Factory, parametrize_device_checks
-from escape_sim.emulators.asm.emulator import AsmEmulator
+from escape_sim.emulators.asm.emulator import PORT, AsmEmulator
 
 # --------------------------------------------------------------------- contract
-_EMULATOR = emulator()
 _SHARED: list[AsmEmulator] = []
 
 
-@pytest.fixture(scope="module", autouse=True)
-def _one_emulator() -> Iterator[None]:
-    yield
-    if _SHARED:
+@pytest.fixture(scope="module")
+def shared_emulator() -> Iterator[AsmEmulator]:
+    with emulator() as made:
+        _SHARED.append(made)
+        yield made
         _SHARED.clear()
-        _EMULATOR.__exit__(None, None, None)
 
 
 def on_the_wire() -> AsmMirror:
-    if not _SHARED:
-        _SHARED.append(_EMULATOR.__enter__())
-    return driver(port_of(_SHARED[0]))
+    """A mirror on the emulator of this file; during collection there is none yet, and nothing is opened."""
+    return driver(port_of(_SHARED[0]) if _SHARED else PORT)
 
 
 def on_the_twin() -> AsmMirror:
@@ -46,11 +49,44 @@ def on_the_twin() -> AsmMirror:
 
 
 @parametrize_device_checks({"asm": on_the_wire})
-def test_contract(factory: Factory, check: Check) -> None:
-    factory()  # starts the emulator
-    before = len(_SHARED[0].violations)
+def test_contract(shared_emulator: AsmEmulator, factory: Factory, check: Check) -> None:
+    before = len(shared_emulator.violations)
     check(factory)
-    assert not _SHARED[0].violations[before:]
+    assert not shared_emulator.violations[before:]
+
+
+@pytest.mark.slow
+def test_a_run_that_only_collects_this_file_ends() -> None:
+    words = [sys.executable, "-m", "pytest", "--collect-only", "-q", "-p", "no:cacheprovider", __file__]
+    done = subprocess.run(words, cwd=Path(__file__).parents[2], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_an_emulator_whose_thread_has_ended_is_stopped_without_waiting() -> None:
+    with emulator() as made:
+        loop, thread = made._loop, made._thread
+        assert loop is not None
+        assert thread is not None
+        loop.call_soon_threadsafe(loop.stop)
+        thread.join(PATIENCE_S)
+        made.stop()
+        assert loop.is_closed()
+
+
+def test_an_emulator_that_hangs_is_left_after_a_while(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("escape_sim.emulators.asm.emulator.STOP_S", 0.05)
+    go_on = threading.Event()
+    with emulator() as made:
+        loop, thread = made._loop, made._thread
+        assert loop is not None
+        assert thread is not None
+        loop.call_soon_threadsafe(go_on.wait)
+        made.stop()
+    go_on.set()
+    thread.join(PATIENCE_S)
+    assert not thread.is_alive()
+    loop.run_until_complete(asyncio.gather(*asyncio.all_tasks(loop), return_exceptions=True))
+    loop.close()
 
 
 def test_an_emulator_joins_the_twin() -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import socket
-import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 
@@ -256,8 +255,14 @@ def test_after_silence_the_shape_is_held_and_then_the_shell_rested() -> None:
 
 
 def test_heartbeats_keep_a_shell_floating() -> None:
-    with emulator(hold_s=1.0, rest_s=2.0) as made, driver(port_of(made), heartbeat_s=0.05) as mirror:
-        time.sleep(2.5)
+    """They renew the time of the last frame, whose age holds and rests a shell, see the test above."""
+    with emulator() as made, driver(port_of(made), heartbeat_s=0.01) as mirror:
+        owner = made.server.owner
+        assert owner is not None
+        for _ in range(3):
+            last_s = owner.last_frame_s
+            wait_for(lambda before=last_s: owner.last_frame_s > before, "a heartbeat")
+        assert made.server.calls[-1][0] == "HEARTBEAT"
         assert mirror.state is ShellState.RUNNING
         assert made.violations == ()
 

@@ -176,7 +176,7 @@ def test_selectors_other_than_the_serial_number_are_not_obliged(xi) -> None:
 
 @pytest.mark.skipif(
     importlib.util.find_spec("ximea") is None,
-    reason="XIMEA's wrapper is not installed; get it with: pip install 'escape-hw[ximea-client]'",
+    reason="needs XIMEA's wrapper, which comes without a licence: pip install 'escape-hw[ximea-client]'",
 )
 def test_ximeas_own_wrapper_runs_on_the_stand_in(xi, monkeypatch) -> None:
     load = ctypes.CDLL

@@ -28,7 +28,8 @@ from escape_hw.io.interchange.milk import layout
 from escape_hw.io.interchange.milk.stream import MilkStream
 
 needs_library = pytest.mark.skipif(
-    not milk_peer.NAME, reason="needs ImageStreamIO; ESCAPE_IMAGESTREAMIO_LIBRARY names it"
+    not milk_peer.NAME,
+    reason="needs ImageStreamIO, no package of Debian or PyPI; ESCAPE_IMAGESTREAMIO_LIBRARY names it",
 )
 SHAPES = [(6,), (5, 7), (3, 3), (4, 3, 2), (48, 64)]
 DTYPES = [dtype.str for dtype in layout.DTYPES.values()]

@@ -29,6 +29,20 @@ def test_a_mirror_is_moved_by_its_driver(document) -> None:
     assert not stand_in("asdk").violations
 
 
+def test_a_mirror_of_an_unknown_arrangement_is_flattened_and_poked(escape, caplog) -> None:
+    words = alpao_words()
+    stand_in("asdk").script("set actuators 192")
+    for verb, rest in (("flat", []), ("poke", ["191", "0.05", "--seconds", "0"]), ("status", [])):
+        caplog.clear()
+        code, _, err = escape("dm", verb, *words, *rest)
+        assert code == 0, err
+        assert "arrangement of its 192 actuators is not known" in caplog.text
+    code, _, err = escape("dm", "wave", *words, "--seconds", "0.1")
+    assert code == 3
+    assert "a wave needs the arrangement of the 192 actuators; give it: --set layout=" in err
+    assert not stand_in("asdk").violations
+
+
 @pytest.mark.parametrize(
     ("words", "code", "message"),
     [
@@ -66,7 +80,8 @@ def test_a_camera_is_read_by_its_driver(document, tmp_path) -> None:
     code, found, _ = document("camera", "settings", *words, *fast, "--exposure", 2e-3)
     assert (code, found["settings"]["exposure_s"]) == (0, pytest.approx(2e-3))
     code, found, _ = document("camera", "stream", *words, *fast, "--seconds", 0.05)
-    assert (code, found["status"]["lost"]) == (0, 0)
+    # A busy computer may lose frames; the exit code tells.
+    assert code == (1 if found["status"]["lost"] else 0)
 
 
 @pytest.mark.usefixtures("short_auto_zero")

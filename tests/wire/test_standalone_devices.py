@@ -13,9 +13,12 @@ from driver_bench import fresh, stand_in
 import escape_hw
 from escape_drivers.alpao import AlpaoMirror
 from escape_drivers.asm import AsmMirror
+from escape_drivers.common.options import known_layout
 from escape_drivers.pi import PiModulator
 from escape_drivers.ximea import XimeaCamera
 from escape_hw.api.adaptive_secondary import ShellState
+from escape_hw.config.layouts import layout_map
+from escape_hw.config.loader import load_system
 from escape_hw.errors import ConfigError, DeviceError, NotOpen, SettingRejected
 from escape_hw.safety.limits import CAUTIOUS_LIMITS
 from escape_hw.testing import Check, Factory, parametrize_device_checks
@@ -59,12 +62,39 @@ def test_a_mirror_takes_its_geometry_from_the_sdk() -> None:
         assert dm.info.stroke_m == 3e-6
 
 
-def test_a_mirror_of_an_unknown_layout_asks_for_it() -> None:
+@pytest.mark.parametrize(("n_act", "rows"), [(69, 9), (97, 11), (241, 17), (277, 19), (468, 24), (820, 32)])
+def test_layouts_of_alpaos_mirrors(n_act: int, rows: int) -> None:
+    grid = layout_map(known_layout(n_act))
+    assert grid.sum() == n_act
+    assert grid.shape == (rows, rows)
+    assert np.array_equal(grid, grid.T), "no direction of the grid is special"
+    assert np.array_equal(grid, grid[::-1, ::-1])
+
+
+def test_a_mirror_of_277_actuators_has_the_layout_of_revolt() -> None:
     dm = mirror()
     stand_in("asdk").script("set actuators 277")
-    with pytest.raises(DeviceError, match=r"has 277 actuators, and no layout .* give its layout"):
-        dm.open()
-    assert not dm.is_open
+    with dm:
+        expected = load_system("revolt-shwfs").devices.dm.info("", simulated=True)
+        assert np.array_equal(dm.info.layout, expected.layout)
+        assert np.array_equal(dm.info.positions_m, expected.positions_m)
+
+
+def test_actuators_of_an_unknown_arrangement_are_all_neighbours(caplog: pytest.LogCaptureFixture) -> None:
+    dm = mirror()
+    stand_in("asdk").script("set actuators 192")
+    with dm:
+        assert "arrangement of its 192 actuators is not known; max_neighbour limits" in caplog.text
+        assert dm.info.layout is None
+        assert dm.info.positions_m.shape == (192, 2)
+        shape = dm.flat
+        shape[5] = 0.1
+        assert dm.send(shape).guard.is_unchanged
+        for _ in range(3):
+            shape[[0, 191]] = 0.3, -0.3
+            sent = dm.send(shape).sent
+        assert np.ptp(sent) <= 0.4 + 1e-9
+    assert not stand_in("asdk").violations
 
 
 def test_the_guard_limits_every_command_of_a_mirror_used_alone() -> None:

@@ -16,7 +16,7 @@ from pydantic import Field
 
 from escape_drivers.alpao.library import AlpaoLibrary, format_version
 from escape_drivers.common.options import (
-    layout_of,
+    known_layout,
     mirror_settings,
     parse_options,
     require_serial,
@@ -97,7 +97,8 @@ class AlpaoMirror(DeformableMirror):
         Name in messages.
     layout
         Arrangement of the actuators, see :mod:`escape_hw.config.layouts`; empty: by the number of
-        actuators, the only part of the geometry that the SDK reports.
+        actuators, the only part of the geometry that the SDK reports. If none is known for this number, the
+        positions in ``info`` are NaN, and ``max_neighbour`` limits the difference of any two actuators.
     pitch_m
         Distance between actuators, metres.
     stroke_m
@@ -218,8 +219,14 @@ class AlpaoMirror(DeformableMirror):
         # Configuration files have names in capitals, and the SDK searches for capitals.
         handle = self._handle = library.init(self._serial.upper())
         n_act = round(library.get(handle, "NbOfActuator"))
-        self._layout = layout = self._layout or layout_of(self.name, n_act)
-        if n_act != (wanted := n_actuators(layout)):
+        layout = self._layout or known_layout(n_act)
+        if not layout:
+            log.warning(
+                "%s: the arrangement of its %d actuators is not known; max_neighbour limits the difference "
+                "of any two of them, and what needs positions is refused; give its layout",
+                self.name, n_act,
+            )  # fmt: skip
+        elif n_act != (wanted := n_actuators(layout)):
             raise DeviceError(
                 self.name,
                 f"has {n_act} actuators, but the layout {shorten(layout)!r} has {wanted}; "
@@ -236,7 +243,8 @@ class AlpaoMirror(DeformableMirror):
         # The buffer never moves, so its address is made once.
         self._buffer = np.zeros(n_act)
         self._transfer = partial(library.c["asdkSend"], handle, c_void_p(self._buffer.ctypes.data))
-        self._info = self._build_info(f"ALPAO mirror, SDK {version}", library.stand_in)
+        self._layout = layout
+        self._info = self._build_info(f"ALPAO mirror, SDK {version}", library.stand_in, n_act)
 
     def _close(self) -> None:
         library, handle = self._library, self._handle
@@ -305,8 +313,11 @@ class AlpaoMirror(DeformableMirror):
         """True with the stand-in of the SDK, behind which is the simulated bench."""
         return self._info is not None and self._info.simulated
 
-    def _build_info(self, model: str, stand_in: bool) -> DMInfo:
+    def _build_info(self, model: str, stand_in: bool, n_act: int = 0) -> DMInfo:
         named = f"{model} (stand-in)" if stand_in else model
+        if not self._layout:
+            unknown = np.full((n_act, 2), math.nan)
+            return DMInfo(named, self._serial, n_act, None, unknown, self._stroke_m, stand_in)
         return mirror_info(
             self._layout, self._pitch_m, self._stroke_m, named, self._serial, simulated=stand_in
         )

@@ -19,8 +19,25 @@ if TYPE_CHECKING:
 
 Options = TypeVar("Options", bound=Section)
 
-#: Layouts of adaptive secondary mirrors by their number of actuators.
-_RINGS = {336: "maps-336", 672: "rings-672"}
+
+def _round(*rows: int) -> str:
+    """A round layout with as many rows as columns, from its first rows up to the widest."""
+    *first, widest = rows
+    middle = [widest] * (widest - 2 * len(first))
+    return "rows:" + ",".join(map(str, [*first, *middle, *reversed(first)]))
+
+
+#: Layouts by the number of actuators: adaptive secondaries, and ALPAO's mirrors that are no ``circle-N``. The
+#: rows of these are in ``alpao_dms_data/configuration.ini`` of the public repository ekarus of
+#: ArcetriAdaptiveOptics (commit 24c67bac), those of 277 actuators also in REVOLT's public configuration.
+_KNOWN_LAYOUTS = {
+    336: "maps-336",
+    672: "rings-672",
+    241: _round(7, 11, 13, 15, 15, 17),
+    277: _round(7, 9, 11, 13, 15, 17, 19),
+    468: _round(8, 12, 16, 18, 20, 20, 22, 22, 24),
+    820: _round(10, 14, 18, 20, 22, 24, 26, 28, 28, 30, 30, 32),
+}
 
 
 def parse_options(kind: type[Options], device: str, options: Mapping[str, Any]) -> Options:
@@ -93,21 +110,27 @@ def require_serial(where: str, serial: str) -> str:
     return serial.strip()
 
 
+def known_layout(n_act: int) -> str:
+    """The layout of a mirror that reports nothing but the number of its actuators; empty if none is known."""
+    if n_act in _KNOWN_LAYOUTS:
+        return _KNOWN_LAYOUTS[n_act]
+    circles = (f"circle-{rows}" for rows in range(2, 100))
+    return next((circle for circle in circles if n_actuators(circle) == n_act), "")
+
+
 def layout_of(device: str, n_act: int) -> str:
-    """The layout of a mirror that reports nothing but the number of its actuators.
+    """As :func:`known_layout`.
 
     Raises
     ------
     DeviceError
         No known layout has so many.
     """
-    if n_act in _RINGS:
-        return _RINGS[n_act]
-    for rows in range(2, 100):
-        if n_actuators(f"circle-{rows}") == n_act:
-            return f"circle-{rows}"
-    raise DeviceError(
-        device,
-        f"has {n_act} actuators, and no layout 'circle-N', 'maps-336' or 'rings-672' has so many; give its "
-        "layout (layout='square-N', or a system file)",
-    )
+    layout = known_layout(n_act)
+    if not layout:
+        raise DeviceError(
+            device,
+            f"has {n_act} actuators, and no known layout has so many; give its layout "
+            "(layout='square-N', or a system file)",
+        )
+    return layout

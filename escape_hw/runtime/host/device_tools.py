@@ -94,9 +94,14 @@ def wave_generator(
     Raises
     ------
     CommandRejected
-        It exceeds a limit at some phase; the message names an amplitude that does not.
+        It exceeds a limit at some phase; the message names an amplitude that does not. Or the mirror's
+        arrangement is not known.
     """
     x = dm.info.positions_m[:, 0]
+    if not np.isfinite(x).all():
+        raise CommandRejected(
+            dm.name, f"a wave needs the arrangement of the {x.size} actuators; give it: --set layout=..."
+        )
     along = waves * (x - x.min()) / max(float(np.ptp(x)), 1e-12)
     flat = dm.flat
     disabled = np.zeros(flat.size, dtype=bool)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import sys
 import threading
 from typing import Annotated, Any, ClassVar
 
@@ -24,6 +26,8 @@ PORT = 7336
 HOLD_S, REST_S = 0.3, 1.0
 #: The same on a simulated bench, whose computation may take longer than the simulated time.
 TWIN_HOLD_S, TWIN_REST_S = 5.0, 20.0
+#: Time in seconds for closing the connections.
+STOP_S = 10.0
 Positive = Annotated[float, Field(gt=0, le=1e6)]
 
 
@@ -105,14 +109,22 @@ class AsmEmulator(Emulator):
         return self._address
 
     def stop(self) -> None:
-        """Close all connections and stop listening; may be repeated."""
-        if self._thread is None or self._loop is None:
-            return
-        asyncio.run_coroutine_threadsafe(self.server.shut_down(), self._loop).result()
-        self._loop.call_soon_threadsafe(self._loop.stop)
-        self._thread.join()
-        self._loop.close()
+        """Close all connections and stop listening; may be repeated. Leaves a thread that does not answer."""
+        thread, loop = self._thread, self._loop
         self._thread = self._loop = None
+        if thread is None or loop is None:
+            return
+        # Threads of this kind no longer run while Python ends, although they count as alive.
+        if thread.is_alive() and not sys.is_finalizing():
+            ending = asyncio.run_coroutine_threadsafe(self.server.shut_down(), loop)
+            with contextlib.suppress(TimeoutError):
+                ending.result(STOP_S)
+            loop.call_soon_threadsafe(loop.stop)
+            thread.join(STOP_S)
+        elif not loop.is_running():
+            loop.run_until_complete(self.server.shut_down())
+        if not loop.is_running():
+            loop.close()
 
     def inject(self, text: str) -> None:
         """Apply a fault of the mirror now, such as ``contaminate:17``; raises ``ConfigError`` if unknown."""
