@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 from pydantic import Field, model_validator
 
 from escape_hw.api.camera import CameraSettings, Region
+from escape_hw.api.flips import FLIPS, Flip, exchanges_axes, flip_order
 from escape_hw.api.mirror import DMInfo
 from escape_hw.config import layouts
-from escape_hw.config.section import LayoutText, RuleViolation, Section, TomlArray, raise_violations
+from escape_hw.config.section import ORDERS, LayoutText, OrderText, RuleViolation, Section, TomlArray, raise_violations
 from escape_hw.safety.limits import MirrorLimits
 
 if TYPE_CHECKING:
@@ -199,6 +200,12 @@ class MirrorConfig(DeviceConfig):
     position_unit: Literal["pitch", "metre", "pupil-radius"] = Field(
         "pitch", description="unit of the positions in a layout 'positions:FILE', on the mirror"
     )
+    order: OrderText = Field(
+        "none",
+        description="numbering of the actuators in the hardware: a flip that makes its map of numbers that of "
+        f"the layout, or a table with the layout's number of each: {ORDERS}",
+    )
+    polarity: Literal[-1, 1] = Field(1, description="-1: a positive command pulls the surface")
     pitch_m: float = Field(gt=0, le=1, description="distance between actuators on the mirror, metres")
     pitches_across_pupil: float = Field(
         gt=0, le=200, description="actuator pitches across the diameter of the pupil"
@@ -260,6 +267,34 @@ class MirrorConfig(DeviceConfig):
         in_pitches = {"pitch": 1.0, "metre": 1 / self.pitch_m, "pupil-radius": self.pitches_across_pupil / 2}
         return layouts.positions(self.layout) * in_pitches[self.position_unit]
 
+    def hardware_order(self, order: str | None = None) -> NDArray[np.intp] | None:
+        """Number in the layout of each actuator of the hardware ``(n_act,)``; ``None``: the same.
+
+        Parameters
+        ----------
+        order
+            By default the key of the same name.
+
+        Raises
+        ------
+        ValueError
+            It does not fit the layout.
+        """
+        import numpy as np
+
+        order = self.order if order is None else order
+        if order == "none":
+            return None
+        for flip in FLIPS:
+            if order == flip:
+                return flip_order(self.positions(), flip)
+        numbers = np.array([int(number) for number in order.removeprefix("numbers:").split(",")], np.intp)
+        if not np.array_equal(np.sort(numbers), np.arange(self.n_act)):
+            raise ValueError(
+                f"has {numbers.size} numbers; the {self.n_act} actuators need each of 0 to {self.n_act - 1} once"
+            )
+        return numbers
+
     def layout_in_pitches(self) -> str:
         """The layout; a table of positions in pitches, whatever its unit."""
         if self.position_unit == "pitch":
@@ -281,6 +316,11 @@ class MirrorConfig(DeviceConfig):
         if len(set(self.limits.disabled)) == self.n_act and not bad:
             text = "disables every actuator; leave at least one in service"
             violations.append(RuleViolation("limits.disabled", list(self.limits.disabled), text))
+        try:
+            self.hardware_order()
+        except ValueError as error:
+            text = f"{error}; give a table ('table:FILE')"
+            violations.append(RuleViolation("order", self.order, text))
         if self.influence == "file" and not self.influence_file:
             violations.append(RuleViolation("influence_file", "", "is required with influence = 'file'"))
         if self.influence_poke == 0:
@@ -299,7 +339,11 @@ class CameraConfig(DeviceConfig):
         description="width and height of the sensor after binning, pixels"
     )
     region: TomlArray[tuple[Pixels, Pixels, Size, Size]] = Field(
-        description="region: x, y, width, height, pixels"
+        description="region: x, y, width, height, pixels of the sensor before any flip"
+    )
+    flip: Flip = Field(
+        "none",
+        description="how images are turned before anything else; 'turn-90' from +x (columns) towards +y (rows)",
     )
     bit_depth: int = Field(ge=8, le=16, description="bits per pixel")
     exposure_s: float = Field(ge=1e-6, le=60, description="exposure time, seconds")
@@ -319,6 +363,9 @@ class CameraConfig(DeviceConfig):
         if x + width > columns or y + height > rows:
             text = f"does not lie on the sensor of {columns} x {rows} pixels"
             violations.append(RuleViolation("region", list(self.region), text))
+        if width != height and exchanges_axes(self.flip):
+            text = f"exchanges rows and columns; needs a square region, not {width} x {height} pixels"
+            violations.append(RuleViolation("flip", self.flip, text))
         if self.exposure_s * self.frame_rate_hz > 1:
             text = f"longer than a frame ({1 / self.frame_rate_hz:.4g} s at {self.frame_rate_hz:g} Hz)"
             violations.append(RuleViolation("exposure_s", self.exposure_s, text))
