@@ -48,8 +48,8 @@ def turn_image(image: NDArray[Any], transpose: bool, flip_x: bool, flip_y: bool)
 def flip_matrix(flip: Flip) -> NDArray[np.intp]:
     """Matrix ``(2, 2)`` that takes the offset (x, y) of a point from the image's centre to its new one."""
     transpose, flip_x, flip_y = _OPERATIONS[flip]
-    matrix = np.array([[0, 1], [1, 0]] if transpose else [[1, 0], [0, 1]], dtype=np.intp)
-    return matrix * np.array([[-1 if flip_x else 1], [-1 if flip_y else 1]])
+    x, y = -1 if flip_x else 1, -1 if flip_y else 1
+    return np.array([[0, x], [y, 0]] if transpose else [[x, 0], [0, y]], dtype=np.intp)
 
 
 def combine_flips(first: Flip, second: Flip) -> Flip:

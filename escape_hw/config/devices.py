@@ -2,15 +2,24 @@
 
 from __future__ import annotations
 
+import contextlib
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from pydantic import Field, model_validator
 
 from escape_hw.api.camera import CameraSettings, Region
-from escape_hw.api.flips import FLIPS, Flip, exchanges_axes, flip_order
+from escape_hw.api.flips import FLIPS, Flip, combine_flips, exchanges_axes, flip_order, inverse_flip
 from escape_hw.api.mirror import DMInfo
 from escape_hw.config import layouts
-from escape_hw.config.section import ORDERS, LayoutText, OrderText, RuleViolation, Section, TomlArray, raise_violations
+from escape_hw.config.section import (
+    ORDERS,
+    LayoutText,
+    OrderText,
+    RuleViolation,
+    Section,
+    TomlArray,
+    raise_violations,
+)
 from escape_hw.safety.limits import MirrorLimits
 
 if TYPE_CHECKING:
@@ -290,9 +299,7 @@ class MirrorConfig(DeviceConfig):
                 return flip_order(self.positions(), flip)
         numbers = np.array([int(number) for number in order.removeprefix("numbers:").split(",")], np.intp)
         if not np.array_equal(np.sort(numbers), np.arange(self.n_act)):
-            raise ValueError(
-                f"has {numbers.size} numbers; the {self.n_act} actuators need each of 0 to {self.n_act - 1} once"
-            )
+            raise ValueError(f"has {numbers.size} numbers; it needs each of 0 to {self.n_act - 1} once")
         return numbers
 
     def layout_in_pitches(self) -> str:
@@ -343,7 +350,7 @@ class CameraConfig(DeviceConfig):
     )
     flip: Flip = Field(
         "none",
-        description="how images are turned before anything else; 'turn-90' from +x (columns) towards +y (rows)",
+        description="how images are turned before anything else; 'turn-90': from columns (+x) towards rows (+y)",
     )
     bit_depth: int = Field(ge=8, le=16, description="bits per pixel")
     exposure_s: float = Field(ge=1e-6, le=60, description="exposure time, seconds")
@@ -439,3 +446,23 @@ class DevicesConfig(Section):
     modulator: ModulatorConfig | None = Field(
         None, description="tip-tilt modulator of a pyramid; absent: none"
     )
+
+    def suggest_orientation(self, flip: Flip, *, opposite: bool) -> str:
+        """Keys with which images are turned further by ``flip``, and commands have the ``opposite`` sign.
+
+        A flip of the actuators' numbering has the same effect on a matrix as one of the camera, if the layout
+        allows it; then both are named.
+        """
+        polarity = f"devices.dm.polarity = {-self.dm.polarity}"
+        if flip == "none":
+            return f"set {polarity}" if opposite else "correct the layout"
+        text = f"set devices.wfs.flip = '{combine_flips(self.wfs.flip, flip)}'"
+        present = next((one for one in FLIPS if one == self.dm.order), None)
+        if present is None:
+            text += " or, if the camera is right, correct the numbers of devices.dm.order"
+        else:
+            order = combine_flips(present, inverse_flip(flip))
+            with contextlib.suppress(ValueError):
+                self.dm.hardware_order(order)
+                text += f" or, if the camera is right, devices.dm.order = '{order}'"
+        return text + f", and {polarity}" * opposite
