@@ -211,8 +211,8 @@ class MirrorConfig(DeviceConfig):
     )
     order: OrderText = Field(
         "none",
-        description="numbering of the actuators in the hardware: a flip that makes its map of numbers that of "
-        f"the layout, or a table with the layout's number of each: {ORDERS}",
+        description="numbering of the actuators in the hardware: a flip that makes its map of numbers that "
+        f"of the layout, or the layout's number of each: {ORDERS}",
     )
     polarity: Literal[-1, 1] = Field(1, description="-1: a positive command pulls the surface")
     pitch_m: float = Field(gt=0, le=1, description="distance between actuators on the mirror, metres")
@@ -350,7 +350,7 @@ class CameraConfig(DeviceConfig):
     )
     flip: Flip = Field(
         "none",
-        description="how images are turned before anything else; 'turn-90': from columns (+x) towards rows (+y)",
+        description="how images are turned before they are used; turn-90 is from +x (columns) to +y (rows)",
     )
     bit_depth: int = Field(ge=8, le=16, description="bits per pixel")
     exposure_s: float = Field(ge=1e-6, le=60, description="exposure time, seconds")

@@ -331,13 +331,11 @@ class SystemConfig(Section):
     def _twin_orientation_rules(self) -> Iterator[RuleViolation]:
         """The true orientations of the twin are possible ones."""
         devices, twin = self.devices, self.twin
-        for name, camera, true in (
-            ("wfs", devices.wfs, twin.wfs),
-            ("science", devices.science, twin.science),
-        ):
-            if camera is not None and camera.region[2] != camera.region[3] and exchanges_axes(true.flip):
+        for name in ("wfs", "science"):
+            camera, flip = getattr(devices, name), getattr(twin, name).flip
+            if camera is not None and camera.region[2] != camera.region[3] and exchanges_axes(flip):
                 text = f"exchanges rows and columns; needs a square devices.{name}.region"
-                yield RuleViolation(f"twin.{name}.flip", true.flip, text)
+                yield RuleViolation(f"twin.{name}.flip", flip, text)
         try:
             devices.dm.hardware_order(twin.mirror.order)
         except ValueError as error:

@@ -208,9 +208,8 @@ def check_fit(
         )
     elif gain < 0:
         reasons.append(
-            "the gain is negative: the mirror pulls where the model pushes; for a mirror of the other "
-            f"polarity {suggest_orientation(model, 'none', opposite=True)}, for a camera turned by 180 degrees "
-            f"{suggest_orientation(model, 'turn-180')}"
+            "the gain is negative: the mirror pulls where the model pushes; if its polarity is reversed, "
+            f"{suggest_orientation(model, 'none', opposite=True)}"
         )
     elif misfit > _MAX_MISFIT:
         outliers = describe_outliers(weighted, residual)
