@@ -89,4 +89,7 @@ def test_a_table_is_not_replaced_by_a_flip() -> None:
     straight = ",".join(map(str, range(37)))
     found = fitted("twin.wfs.flip=up-down", f"devices.dm.order='numbers:{straight}'")
     text = " ".join(found.warnings)
-    assert "devices.wfs.flip = 'up-down' or, if the camera is right, correct the numbers of devices.dm.order" in text
+    assert (
+        "devices.wfs.flip = 'up-down' or, if the camera is right, correct the numbers of devices.dm.order"
+        in text
+    )
