@@ -90,8 +90,8 @@ class DeformableMirror(Device):
         the hardware counts as the layout does. Set before ``open``. Commands, limits and shapes are in the
         numbering of the layout everywhere except in the hooks of drivers.
     polarity
-        -1 if a positive command pulls the surface (``devices.dm.polarity``); drivers get the commands with
-        the opposite sign.
+        -1 if a positive command of the hardware shortens the optical path (``devices.dm.polarity``); drivers
+        get the commands with the opposite sign.
     """
 
     #: Largest step of the ramp of ``flatten``, fraction of full stroke.

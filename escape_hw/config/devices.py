@@ -214,7 +214,7 @@ class MirrorConfig(DeviceConfig):
         description="numbering of the actuators in the hardware: a flip that makes its map of numbers that "
         f"of the layout, or the layout's number of each: {ORDERS}",
     )
-    polarity: Literal[-1, 1] = Field(1, description="-1: a positive command pulls the surface")
+    polarity: Literal[-1, 1] = Field(1, description="-1: a positive command shortens the optical path")
     pitch_m: float = Field(gt=0, le=1, description="distance between actuators on the mirror, metres")
     pitches_across_pupil: float = Field(
         gt=0, le=200, description="actuator pitches across the diameter of the pupil"
@@ -346,11 +346,12 @@ class CameraConfig(DeviceConfig):
         description="width and height of the sensor after binning, pixels"
     )
     region: TomlArray[tuple[Pixels, Pixels, Size, Size]] = Field(
-        description="region: x, y, width, height, pixels of the sensor before any flip"
+        description="region: x, y, width, height, pixels"
     )
     flip: Flip = Field(
         "none",
-        description="how images are turned before they are used; turn-90 is from +x (columns) to +y (rows)",
+        description="how images are turned before they are used; turn-90 is from +x (columns) to +y (rows); "
+        "region and sensor_px are those before",
     )
     bit_depth: int = Field(ge=8, le=16, description="bits per pixel")
     exposure_s: float = Field(ge=1e-6, le=60, description="exposure time, seconds")
