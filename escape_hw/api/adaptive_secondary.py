@@ -56,7 +56,7 @@ class ShellHealth:
     fault
         Cause of a fault, empty otherwise.
     contaminated
-        Actuators that the mirror has disabled; in the numbering of the hardware where a driver reports them.
+        Actuators that the mirror has disabled, in the numbering of the layout; drivers report theirs.
     owner
         Client that has control, if the mirror reports it.
     """
