@@ -21,7 +21,7 @@ from escape_hw.api.modulator import TipTiltModulator
 from escape_hw.api.phase_screen import PhaseScreen
 from escape_hw.api.sensor import SensorGeometry
 from escape_hw.api.synthetic_model import SyntheticModel
-from escape_hw.config.devices import DeviceConfig
+from escape_hw.config.devices import CameraConfig, DeviceConfig, MirrorConfig
 from escape_hw.config.registry import (
     DeviceContext,
     call_factory,
@@ -333,4 +333,9 @@ def _build(
     except ConfigError as error:
         raise ConfigError(f"devices.{name}: {error}") from error
     context = DeviceContext(name, config, shared)
-    return call_factory(f"devices.{name}: driver '{driver}'", kind, factory, section, context)
+    device = call_factory(f"devices.{name}: driver '{driver}'", kind, factory, section, context)
+    if isinstance(device, Camera) and isinstance(section, CameraConfig):
+        device.flip = section.flip
+    elif isinstance(device, DeformableMirror) and isinstance(section, MirrorConfig):
+        device.order, device.polarity = section.hardware_order(), section.polarity
+    return device

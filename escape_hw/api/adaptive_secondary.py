@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import abc
 import enum
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import final
 
 import numpy as np
@@ -56,7 +56,7 @@ class ShellHealth:
     fault
         Cause of a fault, empty otherwise.
     contaminated
-        Actuators that the mirror has disabled.
+        Actuators that the mirror has disabled, in the numbering of the layout; drivers report theirs.
     owner
         Client that has control, if the mirror reports it.
     """
@@ -114,7 +114,7 @@ class AdaptiveSecondary(DeformableMirror):
     def health(self) -> ShellHealth:
         """Present health record."""
         self.require_open()
-        return self._health()
+        return self._in_layout(self._health())
 
     @final
     def observe_health(self) -> ShellHealth:
@@ -125,7 +125,7 @@ class AdaptiveSecondary(DeformableMirror):
         DeviceError
             The mirror reports its health only to the client in control.
         """
-        return self._health() if self.is_open else self._observe_health()
+        return self._in_layout(self._health() if self.is_open else self._observe_health())
 
     @final
     def measured_positions(self) -> NDArray[np.float64]:
@@ -136,7 +136,7 @@ class AdaptiveSecondary(DeformableMirror):
             raise DeviceError(
                 self.name, f"reported positions of shape {positions.shape} for {self.info.n_act} actuators"
             )
-        return positions
+        return self._from_hardware(positions).copy()
 
     @final
     def go_to(self, state: ShellState) -> None:
@@ -184,6 +184,10 @@ class AdaptiveSecondary(DeformableMirror):
             self._recover()
             if self._state() is ShellState.FAULT:
                 raise DeviceError(self.name, f"the fault persists: {self._health().fault}")
+
+    def _in_layout(self, health: ShellHealth) -> ShellHealth:
+        """A health record of the hardware with the numbering of the layout."""
+        return replace(health, contaminated=self._numbers_in_layout(health.contaminated))
 
     def _healthy_state(self) -> ShellState:
         state = self._state()

@@ -5,13 +5,14 @@ from __future__ import annotations
 import abc
 import math
 from collections.abc import Callable
-from dataclasses import astuple, dataclass
+from dataclasses import astuple, dataclass, replace
 from typing import final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from escape_hw.api.device import Device
+from escape_hw.api.flips import Flip, exchanges_axes, flip_image
 from escape_hw.api.representation import short_repr
 from escape_hw.deprecation import renamed_members
 from escape_hw.errors import DeviceError, FrameTimeout, SettingRejected
@@ -43,7 +44,7 @@ class Frame:
 
 @dataclass(frozen=True, slots=True)
 class Region:
-    """Region read from the sensor, in pixels."""
+    """Region read from the sensor, in pixels of the sensor as the driver counts them, before any flip."""
 
     x: int
     y: int
@@ -109,10 +110,15 @@ class Camera(Device):
     ----------
     callback
         Called with every frame, see :class:`~escape_hw.api.callbacks.Callbacks`.
+    flip
+        How frames are turned before they are delivered (``devices.wfs.flip``). Drivers deliver them as they
+        are. Regions and the sensor's size are those of the driver; a flip that exchanges rows and columns
+        needs a square region.
     """
 
     def __init__(self, name: str) -> None:
         super().__init__(name)
+        self.flip: Flip = "none"
         self.callback: Callable[[Frame], object] | None = None
         self._running = False
         self._delivered = self._lost = self._timeouts = 0
@@ -155,6 +161,10 @@ class Camera(Device):
         ):
             raise SettingRejected(
                 self.name, f"region {region} does not lie on the sensor of {columns} x {rows} pixels"
+            )
+        if region.width != region.height and exchanges_axes(self.flip):
+            raise SettingRejected(
+                self.name, f"region {region} must be square, since flip = '{self.flip}' exchanges its sides"
             )
         for name in ("exposure_s", "frame_rate_hz"):
             if not 0 < getattr(want, name) < math.inf:
@@ -258,6 +268,10 @@ class Camera(Device):
             self._lost += frame.index - self._last_index - 1
         self._last_index = frame.index
         self._delivered += 1
+        if self.flip != "none":
+            data = np.ascontiguousarray(flip_image(frame.data, self.flip))
+            data.setflags(write=False)
+            frame = replace(frame, data=data)
         if self.callback is not None:
             self.callback(frame)
         return frame

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import abc
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import final
+from typing import Literal, final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -86,6 +86,13 @@ class DeformableMirror(Device):
         ``flatten``.
     callback
         Called with every shape sent, see :class:`~escape_hw.api.callbacks.Callbacks`.
+    order
+        Number in the layout of each actuator of the hardware ``(n_act,)`` (``devices.dm.order``); ``None``:
+        the hardware counts as the layout does. Set before ``open``. Commands, limits and shapes are in the
+        numbering of the layout everywhere except in the hooks of drivers.
+    polarity
+        -1 if a positive command of the hardware shortens the optical path (``devices.dm.polarity``); drivers
+        get the commands with the opposite sign.
     """
 
     #: Largest step of the ramp of ``flatten``, fraction of full stroke.
@@ -99,6 +106,8 @@ class DeformableMirror(Device):
         self.rejected_count = 0
         self.flatten_count = 0
         self.callback: Callable[[NDArray[np.float64]], object] | None = None
+        self.order: NDArray[np.intp] | None = None
+        self.polarity: Literal[-1, 1] = 1
         self._flat: NDArray[np.float64] | None = None
         self._guard: CommandGuard | None = None
         self._shape_known = False
@@ -158,13 +167,13 @@ class DeformableMirror(Device):
                 self.rejected_count += 1
                 raise
             try:
-                kept_shape = self._send(safe)
+                kept_shape = self._send(self._to_hardware(safe))
             except BaseException:
                 # The command may have reached the mirror although its acknowledgement did not arrive.
                 self._shape_known = False
                 guard.mark_uncertain(safe)
                 raise
-            shape = safe if kept_shape is None else kept_shape
+            shape = safe if kept_shape is None else self._from_hardware(kept_shape)
             guard.set_last(shape)
             self._shape_known = True
             self.sent_count += 1
@@ -243,16 +252,50 @@ class DeformableMirror(Device):
             guard = CommandGuard(self.name, info.n_act, self.limits, _pairs_of(info))
         except ValueError as error:
             raise SettingRejected(self.name, f"its limits do not fit: {error}") from error
-        present = self._present_shape()
+        if self.order is not None and not np.array_equal(np.sort(self.order), np.arange(info.n_act)):
+            raise SettingRejected(
+                self.name,
+                f"order has {self.order.size} numbers; it must have each of 0 to {info.n_act - 1} once",
+            )
+        present = self._present_in_layout()
         guard.reset(present)
         self._guard, self._shape_known = guard, present is not None
         self.sent_count = self.clipped_count = self.rejected_count = self.flatten_count = 0
+
+    def _present_in_layout(self) -> NDArray[np.float64] | None:
+        """The shape that the hardware reports, in the numbering of the layout; ``None``: unknown."""
+        present = self._present_shape()
+        return None if present is None else self._from_hardware(present)
+
+    def _to_hardware(self, shape: NDArray[np.float64]) -> NDArray[np.float64]:
+        """A shape ``(n_act,)`` with the numbering and the sign of the hardware, read-only."""
+        if self.order is None and self.polarity == 1:
+            return shape
+        shape = self.polarity * (shape if self.order is None else shape[self.order])
+        shape.setflags(write=False)
+        return shape
+
+    def _from_hardware(self, shape: NDArray[np.float64]) -> NDArray[np.float64]:
+        """A shape ``(n_act,)`` of the hardware with the numbering and the sign of the layout, read-only."""
+        if self.order is None and self.polarity == 1:
+            return shape
+        in_layout = self.polarity * (shape if self.order is None else shape[np.argsort(self.order)])
+        in_layout.setflags(write=False)
+        return in_layout
+
+    def _numbers_in_layout(self, actuators: Iterable[int]) -> tuple[int, ...]:
+        """Numbers in the layout of actuators of the hardware, ascending."""
+        return _renumber(actuators, self.order)
+
+    def _numbers_in_hardware(self, actuators: Iterable[int]) -> tuple[int, ...]:
+        """Numbers in the hardware of actuators of the layout, ascending."""
+        return _renumber(actuators, None if self.order is None else np.argsort(self.order))
 
     def _before_close(self) -> None:
         self.flatten()
 
     def _present_shape(self) -> NDArray[np.float64] | None:
-        """Shape ``(n_act,)`` of the mirror on opening, if it can be read.
+        """Shape ``(n_act,)`` of the hardware on opening, if it can be read.
 
         ``None``: unknown; the guard assumes zeros, and ``flatten`` always sends.
         """
@@ -265,6 +308,8 @@ class DeformableMirror(Device):
     @abc.abstractmethod
     def _send(self, command: NDArray[np.float64]) -> NDArray[np.float64] | None:
         """Transfer a guarded, C-contiguous, read-only float64 command ``(n_act,)``.
+
+        It has the numbering and the sign of the hardware, as shapes that are read back have.
 
         Returns
         -------
@@ -281,3 +326,10 @@ def _pairs_of(info: DMInfo) -> NDArray[np.intp]:
     if np.isnan(info.positions_m).all():
         return all_pairs(info.n_act)
     return nearest_pairs(info.positions_m)
+
+
+def _renumber(actuators: Iterable[int], numbers: NDArray[np.intp] | None) -> tuple[int, ...]:
+    if numbers is None:
+        return tuple(sorted(actuators))
+    # A number beyond those of the layout is reported as it is: it is another mirror.
+    return tuple(sorted(int(numbers[k]) if k < numbers.size else k for k in actuators))

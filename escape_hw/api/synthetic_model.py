@@ -8,6 +8,7 @@ from typing import Protocol, Self, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
+from escape_hw.api.flips import Flip
 from escape_hw.api.registration import Registration
 
 
@@ -131,6 +132,22 @@ class HasNumberingOffsets(Protocol):
     @property
     def numbering_offsets(self) -> tuple[tuple[int, int], tuple[int, int]]:
         """Competing numberings, see :class:`~escape_hw.api.sensor.SubApertureGrid`."""
+
+
+@runtime_checkable
+class HasOrientation(Protocol):
+    """A model that knows the configured orientation of the camera and numbering of the actuators."""
+
+    def suggest_orientation(self, flip: Flip, *, opposite: bool) -> str:
+        """What to configure so that images are turned further, and commands have the other sign.
+
+        Parameters
+        ----------
+        flip
+            Applied to the images as they are now.
+        opposite
+            Whether the sign of commands changes.
+        """
 
 
 @runtime_checkable

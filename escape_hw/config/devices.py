@@ -2,14 +2,24 @@
 
 from __future__ import annotations
 
+import contextlib
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from pydantic import Field, model_validator
 
 from escape_hw.api.camera import CameraSettings, Region
+from escape_hw.api.flips import FLIPS, Flip, combine_flips, exchanges_axes, flip_order, inverse_flip
 from escape_hw.api.mirror import DMInfo
 from escape_hw.config import layouts
-from escape_hw.config.section import LayoutText, RuleViolation, Section, TomlArray, raise_violations
+from escape_hw.config.section import (
+    ORDERS,
+    LayoutText,
+    OrderText,
+    RuleViolation,
+    Section,
+    TomlArray,
+    raise_violations,
+)
 from escape_hw.safety.limits import MirrorLimits
 
 if TYPE_CHECKING:
@@ -199,6 +209,12 @@ class MirrorConfig(DeviceConfig):
     position_unit: Literal["pitch", "metre", "pupil-radius"] = Field(
         "pitch", description="unit of the positions in a layout 'positions:FILE', on the mirror"
     )
+    order: OrderText = Field(
+        "none",
+        description="numbering of the actuators in the hardware: a flip that makes its map of numbers that "
+        f"of the layout, or the layout's number of each: {ORDERS}",
+    )
+    polarity: Literal[-1, 1] = Field(1, description="-1: a positive command shortens the optical path")
     pitch_m: float = Field(gt=0, le=1, description="distance between actuators on the mirror, metres")
     pitches_across_pupil: float = Field(
         gt=0, le=200, description="actuator pitches across the diameter of the pupil"
@@ -260,6 +276,32 @@ class MirrorConfig(DeviceConfig):
         in_pitches = {"pitch": 1.0, "metre": 1 / self.pitch_m, "pupil-radius": self.pitches_across_pupil / 2}
         return layouts.positions(self.layout) * in_pitches[self.position_unit]
 
+    def hardware_order(self, order: str | None = None) -> NDArray[np.intp] | None:
+        """Number in the layout of each actuator of the hardware ``(n_act,)``; ``None``: the same.
+
+        Parameters
+        ----------
+        order
+            By default the key of the same name.
+
+        Raises
+        ------
+        ValueError
+            It does not fit the layout.
+        """
+        import numpy as np
+
+        order = self.order if order is None else order
+        if order == "none":
+            return None
+        for flip in FLIPS:
+            if order == flip:
+                return flip_order(self.positions(), flip)
+        numbers = np.array([int(number) for number in order.removeprefix("numbers:").split(",")], np.intp)
+        if not np.array_equal(np.sort(numbers), np.arange(self.n_act)):
+            raise ValueError(f"has {numbers.size} numbers; it needs each of 0 to {self.n_act - 1} once")
+        return numbers
+
     def layout_in_pitches(self) -> str:
         """The layout; a table of positions in pitches, whatever its unit."""
         if self.position_unit == "pitch":
@@ -281,6 +323,11 @@ class MirrorConfig(DeviceConfig):
         if len(set(self.limits.disabled)) == self.n_act and not bad:
             text = "disables every actuator; leave at least one in service"
             violations.append(RuleViolation("limits.disabled", list(self.limits.disabled), text))
+        try:
+            self.hardware_order()
+        except ValueError as error:
+            text = f"{error}; give a table ('table:FILE')"
+            violations.append(RuleViolation("order", self.order, text))
         if self.influence == "file" and not self.influence_file:
             violations.append(RuleViolation("influence_file", "", "is required with influence = 'file'"))
         if self.influence_poke == 0:
@@ -301,6 +348,11 @@ class CameraConfig(DeviceConfig):
     region: TomlArray[tuple[Pixels, Pixels, Size, Size]] = Field(
         description="region: x, y, width, height, pixels"
     )
+    flip: Flip = Field(
+        "none",
+        description="how images are turned before they are used; turn-90 is from +x (columns) to +y (rows); "
+        "region and sensor_px are those before",
+    )
     bit_depth: int = Field(ge=8, le=16, description="bits per pixel")
     exposure_s: float = Field(ge=1e-6, le=60, description="exposure time, seconds")
     frame_rate_hz: float = Field(ge=0.01, le=20000, description="frames per second, hertz")
@@ -319,6 +371,9 @@ class CameraConfig(DeviceConfig):
         if x + width > columns or y + height > rows:
             text = f"does not lie on the sensor of {columns} x {rows} pixels"
             violations.append(RuleViolation("region", list(self.region), text))
+        if width != height and exchanges_axes(self.flip):
+            text = f"exchanges rows and columns; needs a square region, not {width} x {height} pixels"
+            violations.append(RuleViolation("flip", self.flip, text))
         if self.exposure_s * self.frame_rate_hz > 1:
             text = f"longer than a frame ({1 / self.frame_rate_hz:.4g} s at {self.frame_rate_hz:g} Hz)"
             violations.append(RuleViolation("exposure_s", self.exposure_s, text))
@@ -392,3 +447,23 @@ class DevicesConfig(Section):
     modulator: ModulatorConfig | None = Field(
         None, description="tip-tilt modulator of a pyramid; absent: none"
     )
+
+    def suggest_orientation(self, flip: Flip, *, opposite: bool) -> str:
+        """Keys with which images are turned further by ``flip``, and commands have the ``opposite`` sign.
+
+        A flip of the actuators' numbering has the same effect on a matrix as one of the camera, if the layout
+        allows it; then both are named.
+        """
+        polarity = f"devices.dm.polarity = {-self.dm.polarity}"
+        if flip == "none":
+            return f"set {polarity}" if opposite else "correct the layout"
+        text = f"set devices.wfs.flip = '{combine_flips(self.wfs.flip, flip)}'"
+        present = next((one for one in FLIPS if one == self.dm.order), None)
+        if present is None:
+            text += " or, if the camera is right, correct the numbers of devices.dm.order"
+        else:
+            order = combine_flips(present, inverse_flip(flip))
+            with contextlib.suppress(ValueError):
+                self.dm.hardware_order(order)
+                text += f" or, if the camera is right, devices.dm.order = '{order}'"
+        return text + f", and {polarity}" * opposite

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from escape_hw.bounded_files import MAX_TEXT_BYTES, read_bounded
-from escape_hw.errors import IncompatibleProduct
+from escape_hw.errors import IncompatibleProduct, ProductError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -177,6 +177,23 @@ def _read_table(name: str, what: str = "table of positions") -> list[list[float]
         raise ValueError(f"the {what} {name!r} has shape {table.shape}; it needs rows and columns")
     rows: list[list[float]] = table.tolist()
     return rows
+
+
+def read_numbers(name: str) -> list[int]:
+    """Whole numbers of a text, .npy or .fits file, row by row; raises :class:`ValueError` for others."""
+    import numpy as np
+
+    from escape_hw.array_files import read_array
+
+    try:
+        numbers = np.asarray(read_array(Path(name).expanduser()), dtype=np.float64).ravel()
+    except (ProductError, ValueError, TypeError) as error:
+        raise ValueError(f"the table of numbers {error}") from error
+    if numbers.size > _MAX_POINTS or not np.array_equal(numbers, np.round(numbers)):
+        raise ValueError(
+            f"the table of numbers {name!r} must have a whole number per actuator, {_MAX_POINTS} at most"
+        )
+    return [int(number) for number in numbers]
 
 
 def _decode_table(content: bytes) -> Any:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 from typing import Annotated, Any, NamedTuple, TypeVar
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict
 from pydantic_core import PydanticCustomError
 
-from escape_hw.config.layouts import resolve_layout
+from escape_hw.api.flips import FLIPS
+from escape_hw.config.layouts import read_numbers, resolve_layout
 from escape_hw.deprecation import warn_renamed
 
 #: Error type of violated rules over several keys.
@@ -71,3 +73,24 @@ def _resolve_layout(layout: str) -> str:
 
 #: A layout, see :mod:`escape_hw.config.layouts`; the content of a file replaces the file's name.
 LayoutText = Annotated[str, AfterValidator(_resolve_layout)]
+
+
+def _resolve_order(order: str) -> str:
+    kind, _, rest = order.partition(":")
+    try:
+        if kind == "table":
+            return "numbers:" + ",".join(map(str, read_numbers(rest)))
+        if kind == "numbers" and re.fullmatch(r"\d{1,5}(,\d{1,5})*", rest):
+            return order
+    except ValueError as error:
+        raise PydanticCustomError("layout", "{text}", {"text": f"order {order[:40]!r}: {error}"}) from error
+    if order not in FLIPS:
+        text = f"order {order[:40]!r} is unknown; choose {ORDERS}"
+        raise PydanticCustomError("layout", "{text}", {"text": text})
+    return order
+
+
+#: What a numbering of actuators may be, for messages.
+ORDERS = f"{', '.join(map(repr, FLIPS))}, 'table:FILE' (text, .npy or .fits) or 'numbers:2,0,1'"
+#: Numbering of the actuators in the hardware; the content of a file replaces the file's name.
+OrderText = Annotated[str, AfterValidator(_resolve_order)]

@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal, Self, TypeVar, get_args
 
 from pydantic import Field, model_validator
 
+from escape_hw.api.flips import exchanges_axes
 from escape_hw.config.choices import (
     ActuatorModel,
     Estimator,
@@ -324,8 +325,21 @@ class SystemConfig(Section):
         if self.loop.dropped_modes >= n_modes:
             text = f"leaves none of the {n_modes} modes; lower it"
             violations.append(RuleViolation("loop.dropped_modes", self.loop.dropped_modes, text))
-        raise_violations([*violations, *self._sensor_rules()])
+        raise_violations([*violations, *self._sensor_rules(), *self._twin_orientation_rules()])
         return self
+
+    def _twin_orientation_rules(self) -> Iterator[RuleViolation]:
+        """The true orientations of the twin are possible ones."""
+        devices, twin = self.devices, self.twin
+        for name in ("wfs", "science"):
+            camera, flip = getattr(devices, name), getattr(twin, name).flip
+            if camera is not None and camera.region[2] != camera.region[3] and exchanges_axes(flip):
+                text = f"exchanges rows and columns; needs a square devices.{name}.region"
+                yield RuleViolation(f"twin.{name}.flip", flip, text)
+        try:
+            devices.dm.hardware_order(twin.mirror.order)
+        except ValueError as error:
+            yield RuleViolation("twin.mirror.order", twin.mirror.order, str(error))
 
     def _region_rules(self, n_sub: int) -> Iterator[RuleViolation]:
         """The region of a Shack-Hartmann sensor has room for its spots."""

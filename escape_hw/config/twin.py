@@ -7,8 +7,9 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
+from escape_hw.api.flips import Flip
 from escape_hw.api.registration import PARAMETERS, Registration
-from escape_hw.config.section import RuleViolation, Section, TomlArray, raise_violations
+from escape_hw.config.section import OrderText, RuleViolation, Section, TomlArray, raise_violations
 
 _Shift = Annotated[float, Field(ge=-500, le=500)]
 _Angle = Annotated[float, Field(ge=-90, le=90)]
@@ -189,6 +190,8 @@ class TwinMirror(Section):
         description="true influence functions: gaussian, exponential, thin-plate, file, or nominal (those of "
         "devices.dm.influence)",
     )
+    order: OrderText = Field("none", description="true value of devices.dm.order")
+    polarity: Literal[-1, 1] = Field(1, description="true value of devices.dm.polarity")
     gain_scatter: float = Field(0.0, ge=0, le=0.5, description="scatter of the actuator gains, rms fraction")
     coupling: float | None = Field(
         None, ge=0.01, le=0.9, description="true coupling, fraction; absent: as devices.dm.coupling"
@@ -238,7 +241,9 @@ class TwinMirror(Section):
 
 
 class TwinCamera(Section):
-    """Signal and noise of a camera (e- = photo-electrons)."""
+    """Orientation, signal and noise of a camera (e- = photo-electrons)."""
+
+    flip: Flip = Field("none", description="true value of the flip of this camera in devices")
 
     photons_per_frame: float = Field(
         1e7, gt=0, le=1e12, description="signal of the whole pupil in one exposure, e-"

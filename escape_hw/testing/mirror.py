@@ -36,7 +36,7 @@ def small_poke(dm: DeformableMirror, amplitude: float = 0.01) -> NDArray[np.floa
 
 @contextmanager
 def record_transfers(dm: DeformableMirror) -> Iterator[list[NDArray[np.float64]]]:
-    """Record every command accepted by the device, in order."""
+    """Record every command accepted by the device, in order, with the numbering of the layout."""
     reached: list[NDArray[np.float64]] = []
     transfer = dm._send
 
@@ -46,7 +46,7 @@ def record_transfers(dm: DeformableMirror) -> Iterator[list[NDArray[np.float64]]
         assert command.shape == (dm.info.n_act,), f"the driver received shape {command.shape}"
         kept = transfer(command)
         if kept is None:
-            reached.append(command.copy())
+            reached.append(dm._from_hardware(command).copy())
         return kept
 
     with replace_hook(dm, "_send", record):

@@ -73,7 +73,7 @@ class IdealSecondary(_NothingToConnect, AdaptiveSecondary):
         return self._current_state
 
     def _step(self, state: ShellState) -> None:
-        self._current_state, self._last = state, self.flat
+        self._current_state, self._last = state, self._to_hardware(self.flat)
 
     def _recover(self) -> None:
         self._current_state = ShellState.RESTED

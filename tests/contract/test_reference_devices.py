@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+from escape_hw.api.flips import flip_order
+from escape_hw.api.mirror import DeformableMirror
 from escape_hw.safety.limits import MirrorLimits
 from escape_hw.testing import (
     Check,
@@ -33,14 +35,30 @@ def biased_mirror() -> RecordingMirror:
     return mirror
 
 
+def rewired(mirror: DeformableMirror) -> DeformableMirror:
+    """Give a mirror of 21 actuators a hardware that counts column by column and pulls."""
+    mirror.order, mirror.polarity = flip_order(RecordingMirror().info.positions_m / 1.5e-3, "transpose"), -1
+    return mirror
+
+
+def turned_camera() -> SyntheticCamera:
+    """Make a camera that is mounted upside down."""
+    camera = SyntheticCamera()
+    camera.flip = "turn-180"
+    return camera
+
+
 FACTORIES: dict[str, Factory] = {
     "mirror": RecordingMirror,
     "mirror-all-limits": lambda: RecordingMirror("tight", TIGHT),
     "mirror-biased": biased_mirror,
     "mirror-wrapped": lambda: FaultyMirror(RecordingMirror("tight", TIGHT)),
     "mirror-biased-wrapped": lambda: FaultyMirror(biased_mirror()),
+    "mirror-rewired": lambda: rewired(RecordingMirror("tight", TIGHT)),
     "secondary": IdealSecondary,
+    "secondary-rewired": lambda: rewired(IdealSecondary()),
     "camera": SyntheticCamera,
+    "camera-turned": turned_camera,
     "camera-wrapped": lambda: FaultyCamera(SyntheticCamera()),
     "modulator": QuantisedModulator,
     "screen": IdealPhaseScreen,

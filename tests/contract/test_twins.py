@@ -7,7 +7,10 @@ from typing import Any
 
 import small_system
 
+from escape_hw.api.camera import Camera
+from escape_hw.api.mirror import DeformableMirror
 from escape_hw.api.modulator import Modulation
+from escape_hw.bench import build_device
 from escape_hw.config.loader import load_system
 from escape_hw.config.registry import DeviceContext
 from escape_hw.config.system import SystemConfig
@@ -37,8 +40,22 @@ def triggered_camera() -> Any:
     return twins.make_wfs_camera(None, DeviceContext("wfs", config, shared))
 
 
+#: A camera that is turned and a mirror that counts and pulls otherwise, and keys that say so.
+MOUNTED = [
+    "twin.wfs.flip=left-right", "devices.wfs.flip=left-right", "twin.mirror.order=turn-90",
+    "devices.dm.order=turn-90", "twin.mirror.polarity=-1", "devices.dm.polarity=-1",
+]  # fmt: skip
+
+
+def mounted(name: str, kind: Any) -> Any:
+    """Make a device of such a bench."""
+    return build_device(name, small_system.configuration(*MOUNTED), kind)
+
+
 TWINS: dict[str, Factory] = {
     "sim-alpao": partial(fresh, twins.make_mirror, "dm"),
+    "sim-alpao-rewired": partial(mounted, "dm", DeformableMirror),
+    "sim-ximea-turned": partial(mounted, "wfs", Camera),
     "sim-asm": partial(fresh, twins.make_secondary, "dm"),
     "sim-ximea": partial(fresh, twins.make_wfs_camera, "wfs"),
     "sim-science": partial(fresh, twins.make_science_camera, "science"),

@@ -168,4 +168,4 @@ def test_a_flip_is_named(model, matrix_at):
         turned[:n, k], turned[n:, k] = y.T[matrix.valid], x.T[matrix.valid]
     estimate = sprint(replace(matrix, data=turned), model, modes=10, solver="registration-only")
     assert not estimate.converged
-    assert any("transposed;" in warning for warning in estimate.warnings), estimate.warnings
+    assert any("pupil transposed:" in warning for warning in estimate.warnings), estimate.warnings

@@ -35,11 +35,16 @@ def _configuration(system: str, overrides: tuple[str, ...]) -> SystemConfig:
     return load_system(system, mode="hardware", overrides=overrides)
 
 
-def make(driver: str, *more: str, system: str = "razor-shwfs") -> Any:
-    """A device of the system, not open, on the stand-in as it is."""
+def configuration_of(driver: str, *more: str, system: str = "razor-shwfs") -> SystemConfig:
+    """The configuration with this driver on the stand-in."""
     key, library = PARTS[driver]
     path = stand_in(library).path
     chosen = (f'devices.{key}.driver="{driver}"', f'devices.{key}.options.library="{path}"')
-    config = _configuration(system, (*chosen, *more))
+    return _configuration(system, (*chosen, *more))
+
+
+def make(driver: str, *more: str, system: str = "razor-shwfs") -> Any:
+    """A device of the system, not open, on the stand-in as it is."""
+    config, key = configuration_of(driver, *more, system=system), PARTS[driver][0]
     section = getattr(config.devices, key)
     return device_factory(driver, hardware=True)(section, DeviceContext(key, config))

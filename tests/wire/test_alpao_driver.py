@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from driver_bench import fresh, make, stand_in
+from driver_bench import configuration_of, fresh, make, stand_in
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from escape_drivers.alpao.library import ERRORS, describe_error, format_version
+from escape_drivers.alpao.mirror import AlpaoMirror
+from escape_hw.bench import build_device
 from escape_hw.config.registry import available
 from escape_hw.errors import CommandRejected, ConfigError, DeviceError, DeviceLost
 
@@ -248,3 +250,15 @@ def test_a_shape_without_acknowledgement_is_flattened(asdk, max_slew) -> None:
         dm.flatten()
         assert not asdk.shape(97).any()
     assert not asdk.violations
+
+
+def test_sequences_have_the_numbering_and_the_sign_of_the_hardware(asdk) -> None:
+    config = configuration_of("alpao", "devices.dm.order=turn-180", "devices.dm.polarity=-1")
+    command = np.linspace(0.0, 0.1, 97)
+    with build_device("dm", config, AlpaoMirror) as dm:
+        dm.send(0.5 * command)
+        assert np.array_equal(asdk.shape(97), -0.5 * command[::-1])
+        dm.play_patterns([command])
+        assert np.array_equal(asdk.shape(97), -command[::-1])
+        assert np.array_equal(dm.shape, command)
+        dm.stop_pattern()

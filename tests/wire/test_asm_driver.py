@@ -21,6 +21,7 @@ from escape_drivers.asm.codec import AsmCodec
 from escape_drivers.asm.mirror import AsmMirror
 from escape_drivers.asm.observer import AsmObserver
 from escape_hw.api.adaptive_secondary import ShellState
+from escape_hw.bench import build_device
 from escape_hw.config.loader import load_system
 from escape_hw.errors import ConfigError, DeviceError, FrameTimeout, SettingRejected
 from escape_hw.testing import Check, Factory, parametrize_device_checks
@@ -142,6 +143,36 @@ def test_disabled_actuators_are_reported_and_never_driven() -> None:
         name, what = made.server.calls[-1]
         assert name == "COMMAND"
         assert not np.asarray(what)[[7, 259, 323]].any()
+
+
+def test_numbers_on_the_wire_are_those_of_the_hardware() -> None:
+    """Commands, positions and actuators out of service, with a hardware that counts mirrored and pulls."""
+    off = [7, 259, 260, 261, 262, 263, 319, 320, 321, 322, 323]
+    words = (f"devices.dm.limits.disabled={off}", "devices.dm.order=left-right", "devices.dm.polarity=-1")
+    config = load_system("maps-nir", overrides=["devices.dm.mode=hardware", *words])
+    order = config.devices.dm.hardware_order()
+    assert order is not None
+    with emulator() as made:
+        in_hardware = [int(np.flatnonzero(order == k)[0]) for k in off]
+        made.controller.contaminated = set(in_hardware[1:])
+        options = {"port": port_of(made), "reply_s": 10.0, "heartbeat_s": 600.0}
+        chosen = [f"devices.dm.options.{key}={value}" for key, value in options.items()]
+        config = load_system("maps-nir", overrides=["devices.dm.mode=hardware", *words, *chosen])
+        shape = np.linspace(-0.05, 0.05, 336)
+        shape[off] = 0.0
+        with build_device("dm", config, AsmMirror) as mirror:
+            name, (disabled, _) = made.server.calls[0]
+            assert (name, set(disabled)) == (
+                "SET_DISABLED",
+                {int(np.flatnonzero(order == k)[0]) for k in off},
+            )
+            assert mirror.health.contaminated == tuple(off[1:])
+            assert np.array_equal(mirror.send(shape).sent, shape)
+            name, what = made.server.calls[-1]
+            assert name == "COMMAND"
+            assert np.asarray(what) == pytest.approx(-shape[order] * 1e-5, abs=1e-12)
+            wait_for(lambda: bool(np.allclose(mirror.measured_positions(), shape, atol=3e-3)), "it moved")
+        assert made.violations == ()
 
 
 def test_acknowledgements_bring_positions_and_times() -> None:

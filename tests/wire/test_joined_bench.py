@@ -45,8 +45,8 @@ def server() -> Iterator[StandInBenchServer]:
         yield one
 
 
-def system(mode: str) -> System:
-    return System.from_config(load_system("razor-shwfs", mode=mode, overrides=JOINED))
+def system(mode: str, *more: str) -> System:
+    return System.from_config(load_system("razor-shwfs", mode=mode, overrides=(*JOINED, *more)))
 
 
 def test_real_drivers_calibrate_and_close_the_loop_as_the_twins_devices_do(server) -> None:
@@ -68,6 +68,28 @@ def test_real_drivers_calibrate_and_close_the_loop_as_the_twins_devices_do(serve
     assert server.requests[RequestKind.SEND] > 300
     for name in ("asdk", "m3api", "aravis"):
         assert not stand_in(name).violations
+
+
+def test_real_drivers_obey_flips_numbering_and_polarity() -> None:
+    """The bench is turned behind the stand-ins; the keys of the devices undo it for their drivers."""
+    for name in ("asdk", "m3api", "aravis"):
+        stand_in(name).clear(record=False)
+    keys = {
+        "wfs.flip": "turn-90", "science.flip": "up-down", "mirror.order": "transpose", "mirror.polarity": -1
+    }  # fmt: skip
+    true = [f"twin.{key}={value}" for key, value in keys.items()]
+    described = [f"devices.{key}={value}".replace("mirror", "dm") for key, value in keys.items()]
+    with system("sim") as bench:
+        straight = bench.calibrate("docrime", frames=100).matrix.data, bench.science.next_frame().data
+    turned = load_system("razor-shwfs", overrides=(*JOINED, *true))
+    with (
+        StandInBenchServer(turned) as server,
+        patch.dict(os.environ, server.environment),
+        system("hardware", *described) as bench,
+    ):
+        through_drivers = bench.calibrate("docrime", frames=100).matrix.data, bench.science.next_frame().data
+    for one, other in zip(through_drivers, straight, strict=True):
+        assert np.array_equal(one, other)
 
 
 def test_the_science_camera_sees_the_same_beam(server) -> None:

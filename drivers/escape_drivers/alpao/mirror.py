@@ -180,11 +180,12 @@ class AlpaoMirror(DeformableMirror):
         """
         with self._lock:
             sequence = self._validate_sequence(patterns, repeats)
+            in_hardware = np.ascontiguousarray([self._to_hardware(shape) for shape in sequence])
             self._stop_playing()
             library, handle = self._require_connected()
             # The mirror's shape is unknown from here on, also if the call fails: the next flatten() sends.
             self._playing, self._shape_known = True, False
-            pointer = c_void_p(sequence.ctypes.data)
+            pointer = c_void_p(in_hardware.ctypes.data)
             library.call("asdkSendPattern", handle, pointer, len(sequence), repeats)
             self._guard_when_open().reset(sequence[-1])
 

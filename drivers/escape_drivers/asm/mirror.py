@@ -251,10 +251,15 @@ class AsmMirror(AdaptiveSecondary):
 
     def _open(self) -> None:
         self._link.address = self._start_address()
-        self._apply_welcome(self._link.connect())
+        self._apply_welcome(self._connect(self._link))
         period_s = self._options.heartbeat_s / 4
         self._heartbeat = BackgroundThread(f"{self.name} heartbeat", self._send_heartbeat_if_due, period_s)
         self._heartbeat.start()
+
+    def _connect(self, link: AsmLink) -> m.Welcome:
+        """Connect; the mirror's report has the disabled actuators in the numbering of the layout."""
+        welcome = link.connect()
+        return replace(welcome, disabled=self._numbers_in_layout(welcome.disabled))
 
     def _apply_welcome(self, welcome: m.Welcome) -> None:
         """Adopt identity and state of the mirror at the beginning of a connection."""
@@ -266,7 +271,8 @@ class AsmMirror(AdaptiveSecondary):
             self._metres = np.empty(n_actuators(expected.layout))
         disabled = require_compatible(self.name, self.limits, self._stroke_m, welcome)
         if disabled:
-            self._link.request(m.SetDisabled(disabled, "devices.dm.limits.disabled"), m.Done)
+            in_hardware = self._numbers_in_hardware(disabled)
+            self._link.request(m.SetDisabled(in_hardware, "devices.dm.limits.disabled"), m.Done)
         self._last_state, self._consecutive_skips = welcome.state, 0
         is_floating = welcome.state in (ShellState.SET, ShellState.RUNNING)
         self._initial_shape = (
@@ -335,14 +341,14 @@ class AsmMirror(AdaptiveSecondary):
     def _reconnect(self) -> None:
         """Restore a lost connection; the mirror keeps its state, and nothing is sent again."""
         self._last_attempt_s = time.monotonic()
-        welcome = self._link.connect()
+        welcome = self._connect(self._link)
         try:
             self._apply_welcome(welcome)
         except DeviceError as error:
             self._link.disconnect(f"it came back, but {error.args[1]}")
             raise
         # What became of the last command before the link broke is not known; its shape is.
-        self._guard_when_open().reset(self._initial_shape)
+        self._guard_when_open().reset(self._present_in_layout())
         log.warning(
             "%s: the link is back; the mirror is %s, nothing was sent again", self.name, self._last_state
         )
@@ -382,8 +388,7 @@ class AsmMirror(AdaptiveSecondary):
         link = self._make_link(m.Role.TELEMETRY)
         link.address = self._start_address()
         try:
-            welcome = link.connect()
-            self._update_info(welcome)
+            self._update_info(self._connect(link))
             return _to_shell_health(link.request(m.GetHealth(), m.HealthReport))
         finally:
             link.disconnect("status query only")
@@ -439,7 +444,7 @@ class AsmMirror(AdaptiveSecondary):
                 f"skipped {self._consecutive_skips} commands in a row and kept its last shape; they exceed "
                 f"limits of its own: lower max_slew in devices.{self.name}.limits, and see its health",
             )
-        return self._guard_when_open().last
+        return self._to_hardware(self._guard_when_open().last)
 
     def _device_error_for(self, refusal: MirrorRefusal) -> DeviceError:
         """The error for a refused command, in the words of every adaptive secondary."""

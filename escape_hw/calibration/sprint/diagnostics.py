@@ -12,8 +12,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from escape_hw.api.flips import Flip, flip_matrix, inverse_flip
 from escape_hw.api.interaction_matrix import InteractionMatrix
-from escape_hw.api.synthetic_model import DifferentiableModel, SyntheticModel
+from escape_hw.api.synthetic_model import DifferentiableModel, HasOrientation, SyntheticModel
 from escape_hw.calibration.sprint.coarse_search import MIN_EXPLAINED_FRACTION, weigh_low_modes
 from escape_hw.calibration.sprint.least_squares import LeastSquaresProblem
 from escape_hw.calibration.sprint.weighted_matrix import WeightedMatrix
@@ -86,15 +87,15 @@ def describe_degeneracies(covariance: NDArray[np.float64], names: Sequence[str])
     return tuple(notes)
 
 
-#: Orientation of the pupil on the sensor, and the map of (row, column) offsets from its centre.
-_ORIENTATIONS = {
-    "mirrored left to right": ((1, 0), (0, -1)),
-    "upside down": ((-1, 0), (0, 1)),
-    "turned by 180 degrees": ((-1, 0), (0, -1)),
-    "turned by 90 degrees": ((0, -1), (1, 0)),
-    "turned by 270 degrees": ((0, 1), (-1, 0)),
-    "transposed": ((0, 1), (1, 0)),
-    "transposed about the other diagonal": ((0, -1), (-1, 0)),
+#: Orientation of the pupil on the sensor, by the flip of the camera's images that restores it.
+_ORIENTATIONS: dict[Flip, str] = {
+    "left-right": "mirrored left to right",
+    "up-down": "upside down",
+    "turn-180": "turned by 180 degrees",
+    "turn-90": "turned by 90 degrees",
+    "turn-270": "turned by 270 degrees",
+    "transpose": "transposed",
+    "anti-transpose": "transposed about the other diagonal",
 }
 _ITERATIONS = 10
 
@@ -113,16 +114,24 @@ def check_orientation(
     if not isinstance(model, DifferentiableModel):
         return None
     weighted = weigh_low_modes(matrix, model, columns)
-    for orientation, reoriented in _reoriented(weighted):
+    for flip, reoriented in _reoriented(weighted):
         problem = LeastSquaresProblem(reoriented, model)
         *_, fit = problem.descend(np.zeros(5), _ITERATIONS)
         if reoriented.explained_fraction(fit.residual) >= MIN_EXPLAINED_FRACTION * reoriented.signal_fraction:
             sign = " and the polarity were reversed" if fit.gain < 0 else ""
-            return f"it would if the sensor saw the pupil {orientation}{sign}; check the layout and the flips"
+            remedy = suggest_orientation(model, flip, opposite=fit.gain < 0)
+            return f"it would if the sensor saw the pupil {_ORIENTATIONS[flip]}{sign}: {remedy}"
     return None
 
 
-def _reoriented(weighted: WeightedMatrix) -> Iterator[tuple[str, WeightedMatrix]]:
+def suggest_orientation(model: SyntheticModel, flip: Flip, *, opposite: bool = False) -> str:
+    """What to set so that images are turned further by ``flip``, and commands have the ``opposite`` sign."""
+    if isinstance(model, HasOrientation):
+        return model.suggest_orientation(flip, opposite=opposite)
+    return "check the layout, the flips and the polarity"
+
+
+def _reoriented(weighted: WeightedMatrix) -> Iterator[tuple[Flip, WeightedMatrix]]:
     """The matrix as seen by a sensor in each orientation; slopes that it would not have get no weight."""
     valid = weighted.valid
     number = np.full(valid.shape, -1)
@@ -130,8 +139,9 @@ def _reoriented(weighted: WeightedMatrix) -> Iterator[tuple[str, WeightedMatrix]
     middle = (np.array(valid.shape) - 1) / 2
     positions = np.argwhere(valid)
     n = len(positions)
-    for orientation, transform in _ORIENTATIONS.items():
-        rotation = np.array(transform)
+    for flip in _ORIENTATIONS:
+        # Where the restored image has its content from; axes (row, column) instead of (x, y).
+        rotation = flip_matrix(inverse_flip(flip))[::-1, ::-1]
         if valid.shape[0] != valid.shape[1] and rotation[0, 0] == 0:
             continue
         target = np.rint((positions - middle) @ rotation.T + middle).astype(int)
@@ -145,4 +155,4 @@ def _reoriented(weighted: WeightedMatrix) -> Iterator[tuple[str, WeightedMatrix]
             at = source[rows] + from_half * n
             data[rows + half * n] = rotation.T[axis, along] * weighted.data[at]
             noise[rows + half * n] = weighted.by_slope[at]
-        yield orientation, replace(weighted, data=data, by_slope=noise)
+        yield flip, replace(weighted, data=data, by_slope=noise)

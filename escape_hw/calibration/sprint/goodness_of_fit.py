@@ -13,12 +13,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from escape_hw.api.flips import Flip
 from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.registration import PARAMETERS, Registration
 from escape_hw.api.results import GoodnessOfFit, find_outliers
 from escape_hw.api.synthetic_model import SyntheticModel
 from escape_hw.calibration.sprint.coarse_search import MIN_EXPLAINED_FRACTION
-from escape_hw.calibration.sprint.diagnostics import check_orientation
+from escape_hw.calibration.sprint.diagnostics import check_orientation, suggest_orientation
 from escape_hw.calibration.sprint.tip_tilt import remove_tip_tilt
 from escape_hw.calibration.sprint.weighted_matrix import WeightedMatrix
 
@@ -210,8 +211,8 @@ def check_fit(
         )
     elif gain < 0:
         reasons.append(
-            "the gain is negative: the mirror pulls where the model pushes; check its polarity, "
-            "or whether the camera is turned by 180 degrees"
+            "the gain is negative: the mirror pulls where the model pushes; if its polarity is reversed, "
+            f"{suggest_orientation(model, 'none', opposite=True)}"
         )
     elif misfit > _MAX_MISFIT:
         outliers = describe_outliers(weighted, residual)
@@ -220,7 +221,7 @@ def check_fit(
             f"the model does not fit: {misfit:.0%} of the matrix remain beyond its noise (reduced "
             f"chi-squared {weighted.reduced_chi_squared(residual):.3g}); {where}"
         )
-    return reasons + _implausible_values(registration)
+    return reasons + _implausible_values(registration, model)
 
 
 def _probable_cause(
@@ -241,7 +242,11 @@ def _probable_cause(
     return "wrong layout, flip or basis, or a registration beyond capture"
 
 
-def _implausible_values(registration: Registration) -> list[str]:
+#: Flip that undoes a rotation of the mirror on the sensor, by the number of quarter turns.
+_UNDOES: dict[int, Flip] = {1: "turn-270", 2: "turn-180", 3: "turn-90"}
+
+
+def _implausible_values(registration: Registration, model: SyntheticModel) -> list[str]:
     """Reasons why a registration cannot be that of a mirror and a sensor that were aligned to each other."""
     reasons = []
     for name in PARAMETERS[3:]:
@@ -252,8 +257,11 @@ def _implausible_values(registration: Registration) -> list[str]:
                 "the pitch and the number of sub-apertures"
             )
     if abs(registration.rotation) > _MAX_ROTATION:
+        quarter_turns = round(registration.rotation / 90)
+        is_quarter_turn = abs(registration.rotation - 90 * quarter_turns) < _MAX_ROTATION
+        flip = _UNDOES.get(quarter_turns % 4) if is_quarter_turn else None
+        remedy = "check the layout and the flips" if flip is None else suggest_orientation(model, flip)
         reasons.append(
-            f"rotation is {registration.rotation:.0f} degrees, beyond {_MAX_ROTATION:.0f}: check the layout "
-            "and the flips"
+            f"rotation is {registration.rotation:.0f} degrees, beyond {_MAX_ROTATION:.0f}: {remedy}"
         )
     return reasons

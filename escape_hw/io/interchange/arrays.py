@@ -10,12 +10,13 @@ import os
 import tomllib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from escape_hw.api.flips import turn_image
 from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.pyramid import PyramidPupils
 from escape_hw.api.results import CalibrationResult
@@ -300,18 +301,12 @@ def _turn_camera(
     """Mask and slopes in the orientation of the system's camera."""
     number = np.full(valid.shape, -1)
     number[valid] = np.arange(int(valid.sum()))
-    number = _turn(number, table.transpose, table.flip_x, table.flip_y)
+    number = turn_image(number, table.transpose, table.flip_x, table.flip_y)
     if table.transpose:
         x, y = y, x
     rows = number[number >= 0]
     sign_x, sign_y = table.sign_x * (-1 if table.flip_x else 1), table.sign_y * (-1 if table.flip_y else 1)
     return number >= 0, sign_x * x[rows], sign_y * y[rows]
-
-
-def _turn(image: NDArray[Any], transpose: bool, flip_x: bool, flip_y: bool) -> NDArray[Any]:
-    image = image.T if transpose else image
-    image = image[:, ::-1] if flip_x else image
-    return image[::-1] if flip_y else image
 
 
 def _centre_mask(valid: NDArray[np.bool_], n_sub: int) -> NDArray[np.bool_]:
@@ -360,7 +355,7 @@ def _order_on_grid(table: ActuatorTable, target: ArrayTarget) -> NDArray[np.intp
         )
     ours = np.full(target.layout.shape, -1)
     ours[target.layout] = np.arange(target.n_act)
-    theirs = _turn(ours, False, table.flip_x, table.flip_y)
+    theirs = turn_image(ours, False, table.flip_x, table.flip_y)
     theirs = theirs.T if table.transpose else theirs
     return np.asarray(theirs[theirs >= 0], dtype=np.intp)
 

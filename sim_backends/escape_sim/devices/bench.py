@@ -90,6 +90,7 @@ class SimBench:
             self.influence.n_act, twin.mirror.settling_s, twin.mirror.creep_fraction, twin.mirror.creep_time_s
         )
         # A reflection changes the path by twice the surface.
+        self._order = dm.hardware_order(twin.mirror.order)
         self._opd_per_command_m = np.float32(2 * (twin.mirror.stroke_m or dm.stroke_m))
         self._ncpa = self._make_aberration(truth, twin.ncpa.rms_m, twin.ncpa.n_modes)
         self._vibration_phase = truth.uniform(0, 2 * np.pi, (2, len(twin.vibration.frequency_hz)))
@@ -139,18 +140,25 @@ class SimBench:
 
     # ------------------------------------------------------------------ mirror
     def drive(self, shape: NDArray[np.float64]) -> None:
-        """Command a shape ``(n_act,)``, which arrives after the twin's latency and jitter."""
+        """Command a shape ``(n_act,)`` of the hardware; it arrives after the twin's latency and jitter."""
         twin = self.config.twin
         jitter = twin.latency_jitter_s * abs(self.latency_rng.standard_normal())
-        self.dynamics.command(self.now_s + twin.latency_s + jitter, shape)
+        self.dynamics.command(self.now_s + twin.latency_s + jitter, self._in_layout(shape))
 
     def set_positions(self, shape: NDArray[np.float64]) -> None:
-        """Command a shape ``(n_act,)`` without latency."""
-        self.dynamics.command(self.now_s, shape)
+        """Command a shape ``(n_act,)`` of the hardware without latency."""
+        self.dynamics.command(self.now_s, self._in_layout(shape))
 
     def positions(self) -> NDArray[np.float64]:
-        """Present displacements of the actuators ``(n_act,)``, fractions of full stroke."""
-        return self.dynamics.at(self.now_s)
+        """Present displacements ``(n_act,)``, fractions of full stroke, as the hardware reports them."""
+        shape = self.config.twin.mirror.polarity * self.dynamics.at(self.now_s)
+        return shape if self._order is None else shape[self._order]
+
+    def _in_layout(self, shape: NDArray[np.float64]) -> NDArray[np.float64]:
+        """True numbering and sign of a shape of the hardware."""
+        if self._order is None:
+            return self.config.twin.mirror.polarity * shape
+        return self.config.twin.mirror.polarity * shape[np.argsort(self._order)]
 
     # ------------------------------------------------------------------ beam
     def optical_path(self, start_s: float, end_s: float) -> NDArray[np.float32]:

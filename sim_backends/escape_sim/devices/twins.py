@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from escape_hw.api.adaptive_secondary import AdaptiveSecondary, ShellHealth, ShellState
 from escape_hw.api.camera import Camera, CameraInfo, CameraSettings, Frame, Region
+from escape_hw.api.flips import Flip, flip_image, inverse_flip
 from escape_hw.api.mirror import DeformableMirror, DMInfo
 from escape_hw.api.modulator import Modulation, ModulatorInfo, TipTiltModulator
 from escape_hw.api.phase_screen import PhaseScreen, ScreenInfo, ScreenState
@@ -221,6 +222,7 @@ class SimWavefrontSensorCamera(_SimCamera):
         gain = 10 ** (s.gain_db / 20)
         source, sky = bench.wfs_light(s.exposure_s)
         data, saturated = bench.wfs_detector.expose(image, source * gain, sky * gain)
+        data = _as_mounted(data, twin.wfs.flip)
         r, n = s.region, self._nominal
         data = data[r.y - n.y : r.y - n.y + r.height, r.x - n.x : r.x - n.x + r.width]
         data.flags.writeable = False
@@ -258,8 +260,14 @@ class SimScienceCamera(_SimCamera):
         scale = s.exposure_s / bench.science_section.exposure_s
         electrons = 0.0 if bench.beam_blocked else bench.config.twin.science.photons_per_frame * scale
         data, saturated = self._detector.expose(image, electrons)
+        data = _as_mounted(data, bench.config.twin.science.flip)
         data.flags.writeable = False
         return Frame(data, k, round(end * 1e9), bench.now_ns, saturated)
+
+
+def _as_mounted(image: NDArray[np.uint16], flip: Flip) -> NDArray[np.uint16]:
+    """The image of a camera whose images must be turned by ``flip``."""
+    return np.ascontiguousarray(flip_image(image, inverse_flip(flip)))
 
 
 class SimPhaseScreen(_Simulated[ScreenInfo], PhaseScreen):
@@ -363,7 +371,7 @@ class SimAdaptiveSecondary(_Simulated[DMInfo], AdaptiveSecondary):
 
     def _step(self, state: ShellState) -> None:
         self._bench.advance_to(self._bench.now_s + TRANSITION_S[state])
-        self._shell.finish_transition(state, self.flat)
+        self._shell.finish_transition(state, self._to_hardware(self.flat))
 
     def _recover(self) -> None:
         self._shell.recover()

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Self
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+from escape_hw.api.flips import Flip
 from escape_hw.api.registration import Registration
 from escape_hw.api.synthetic_model import PROFILE_WIDTHS
 from escape_sim.mirror.influence_functions import InfluenceFunctions
@@ -40,6 +41,10 @@ class DesignModel:
     def actuator_positions_m(self) -> NDArray[np.float64]:
         """Nominal positions of the actuators ``(n_act, 2)`` as (x, y) on the pupil in metres."""
         return self._nominal.positions_m
+
+    def suggest_orientation(self, flip: Flip, *, opposite: bool) -> str:
+        """Keys that turn the camera or renumber the actuators, see :class:`HasOrientation`."""
+        return self._config.devices.suggest_orientation(flip, opposite=opposite)
 
     @property
     def profile_shares(self) -> tuple[float, ...]:

@@ -71,7 +71,8 @@ class AsmEmulator(Emulator):
         hold_s, rest_s = (HOLD_S, REST_S) if bench is None else (TWIN_HOLD_S, TWIN_REST_S)
         actuators: MovingActuators = bench or RealTimeActuators(dm.n_act, config.twin.mirror.settling_s)
         noise = np.random.default_rng(np.random.SeedSequence(config.system.seed, spawn_key=(0xA5,)))
-        limits = dm.limits
+        limits, order = dm.limits, dm.hardware_order(config.twin.mirror.order)
+        disabled = limits.disabled if order is None else np.flatnonzero(np.isin(order, limits.disabled))
         slew = limits.max_slew if limits.max_slew is not None else 2.0
         self.controller = AsmController(
             Shell(actuators, dm.n_act, dm.stroke_m, noise),
@@ -79,7 +80,7 @@ class AsmEmulator(Emulator):
                 limits.max_stroke * dm.stroke_m, slew * dm.stroke_m,
                 options.hold_s or hold_s, options.rest_s or rest_s,
             ),
-            {*limits.disabled, *_actuator_option(options.contaminated, dm.n_act)},
+            {*map(int, disabled), *_actuator_option(options.contaminated, dm.n_act)},
             speed=options.transition_speed,
             pass_time=None if bench is None else lambda s: bench.advance_to(bench.now_s + s),
         )  # fmt: skip
