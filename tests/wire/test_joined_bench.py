@@ -54,9 +54,7 @@ def test_real_drivers_calibrate_and_close_the_loop_as_the_twins_devices_do(serve
     for mode in ("hardware", "sim"):
         with system(mode) as bench:
             assert bench.simulated, "behind a stand-in there is no metal"
-            assert BenchRecord.from_bench(bench).injected is not None, (
-                "[twin] applies through drivers as well"
-            )
+            assert BenchRecord.from_bench(bench).injected is not None, "drivers apply [twin] too"
             found = bench.calibrate("docrime", frames=300)
             run = bench.close_loop(found.matrix, found.grid, frames=60)
             results[mode] = found.matrix.data, bench.wfs.status(), run
