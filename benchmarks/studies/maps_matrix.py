@@ -24,8 +24,10 @@ from numpy.typing import NDArray
 from realisation_tables import study_parser
 
 from escape_hw.api.interaction_matrix import InteractionMatrix
+from escape_hw.api.pyramid import PyramidPupils
 from escape_hw.api.registration import PARAMETERS, Registration
 from escape_hw.api.results import CalibrationResult, RegistrationEstimate
+from escape_hw.api.sensor import require_kind
 from escape_hw.array_files import read_array
 from escape_hw.calibration.modes.bases import build_basis
 from escape_hw.calibration.sprint.fit import sprint
@@ -83,12 +85,21 @@ def import_published(data: Path, folder: Path, settings: list[str]) -> Calibrati
     return import_arrays(description, folder, target, data / _FILE)
 
 
-def measure_twin(settings: list[str], registration: Registration, frames: int) -> InteractionMatrix:
-    """DO-CRIME in open loop on the twin, contaminated as bundled, with a mirror registered as the published."""
+def measure_twin(
+    settings: list[str], registration: Registration, images: PyramidPupils, frames: int
+) -> InteractionMatrix:
+    """DO-CRIME in open loop on the twin, contaminated as bundled, with the published registration.
+
+    The pupil images are exactly where the published settings have them, and their pixels are numbered as in
+    the published maps, so that the same element of both matrices is the same pixel.
+    """
     values = zip(PARAMETERS, registration.to_array(), strict=True)
     injected = [f"twin.registration.{name}={value:.6f}" for name, value in values]
-    with open_system("maps-vis", set=[*settings, *injected]) as twin:
-        return twin.calibrate("docrime", frames=frames).matrix
+    centred = f"twin.pyramid.centre_offsets_px={[[0, 0]] * 4}"
+    with open_system("maps-vis", set=[*settings, *injected, centred]) as twin:
+        found = twin.find_sensor().grid
+        grid = replace(found, centres_px=images.centres_px, corners_px=images.corners_px)
+        return twin.calibrate("docrime", frames=frames, grid=grid).matrix
 
 
 def restrict(matrix: InteractionMatrix, valid: NDArray[np.bool_]) -> InteractionMatrix:
@@ -147,7 +158,7 @@ def compare(matrices: Mapping[str, InteractionMatrix]) -> dict[str, NDArray[np.f
 
 def by_group(columns: Mapping[str, NDArray[np.float64]]) -> dict[str, dict[str, float]]:
     """Means over groups of modes."""
-    edges = list(zip((0, *GROUPS), GROUPS, strict=False)) + [(0, N_MODES)]
+    edges = [*zip((0, *GROUPS), GROUPS, strict=False), (0, N_MODES)]
     return {
         name: {f"{a + 1}-{b}": round(float(values[a:b].mean()), 3) for a, b in edges}
         for name, values in columns.items()
@@ -185,7 +196,8 @@ def main() -> None:
         matrix, model = result.matrix, make_fast_model(config, result.grid)
         estimate = sprint(matrix, model, solver="registration-only", modes=N_FITTED)
         m2c = build_basis(config, *model.influence_functions(), ())
-        twin = measure_twin(settings, estimate.registration, options.frames)
+        images = require_kind(result.grid, PyramidPupils)
+        twin = measure_twin(settings, estimate.registration, images, options.frames)
     synthetic = model.zonal_matrix(estimate.registration)
     matrices = {
         label: InteractionMatrix(
@@ -204,7 +216,7 @@ def main() -> None:
         "by group": by_group(columns),
         "by mode": {name: np.round(values, 4).tolist() for name, values in columns.items()},
     }  # fmt: skip
-    (options.out / "maps-matrices.png").write_bytes(style.png(draw(matrices, columns), dpi=120))
+    (options.out / "maps-matrices.png").write_bytes(style.png(draw(matrices, columns), dpi=140))
     (options.out / "maps.json").write_text(dumps(document) + "\n")
     print(dumps({name: value for name, value in document.items() if name != "by mode"}))
 

@@ -1,4 +1,4 @@
-"""The figure of ``maps_matrix.py``: matrices of 100 modes, their correlation by mode, and maps of some modes."""
+"""The figure of ``maps_matrix.py``: maps of all modes, correlation by mode, and larger maps of some modes."""
 
 from __future__ import annotations
 
@@ -22,36 +22,40 @@ CURVES = {
 }
 
 
-def draw(
-    matrices: Mapping[str, InteractionMatrix], columns: Mapping[str, NDArray[np.float64]]
-) -> Figure:
+def draw(matrices: Mapping[str, InteractionMatrix], columns: Mapping[str, NDArray[np.float64]]) -> Figure:
     """One figure of three parts, from top to bottom."""
-    figure = style.new_figure(9.4, 16.2)
-    whole, curves, maps = figure.subfigures(3, 1, height_ratios=[4.6, 2.4, 9.2], hspace=0.02)
-    draw_whole(whole, matrices)
+    figure = style.new_figure(8.2, 17.4)
+    whole, curves, maps = figure.subfigures(3, 1, height_ratios=[5.4, 2.2, 8.4])
+    draw_all_modes(whole, matrices)
     draw_correlations(curves, columns)
     draw_mode_maps(maps, matrices, N_DRAWN)
     return figure
 
 
-def draw_whole(figure: FigureBase, matrices: Mapping[str, InteractionMatrix]) -> None:
-    """All slopes (rows) of all modes (columns), each mode relative to its rms."""
-    axes = figure.subplots(1, len(matrices), sharey=True)
-    for cell, (label, matrix) in zip(axes, matrices.items(), strict=True):
-        data = matrix.data / np.sqrt(np.square(matrix.data).mean(axis=0))
-        n = matrix.n_slopes // 2
-        cell.imshow(
-            data, cmap=style.DIVERGING, vmin=-LIMIT, vmax=LIMIT, aspect="auto", interpolation="antialiased",
-            extent=(0.5, matrix.n_modes + 0.5, 2 * n, 0),
-        )  # fmt: skip
-        cell.axhline(n, color=style.INK, lw=0.8)
-        style.style_axes(cell, grid=False).set_xlabel("mode")
-        cell.set_xticks([1, 20, 40, 60, 80, 100])
-        cell.set_title(label, color=style.INK, fontsize=10, fontweight="bold")
-    axes[0].set_yticks([n / 2, 3 * n / 2], [f"{n} x slopes", f"{n} y slopes"], rotation=90, va="center")
-    style.colour_bar(
-        figure, list(axes), style.DIVERGING, (-LIMIT, LIMIT), "slope / rms slope of the mode"
-    )
+def draw_all_modes(figure: FigureBase, matrices: Mapping[str, InteractionMatrix]) -> None:
+    """The maps of all modes in rows of ten, x slopes above y slopes, each mode relative to its rms."""
+    axes = figure.subplots(2, len(matrices))
+    for column, (label, matrix) in enumerate(matrices.items()):
+        axes[0, column].set_title(label, color=style.INK, fontsize=10, fontweight="bold")
+        pair = np.array([matrix.maps(mode) for mode in range(matrix.n_modes)])
+        pair /= np.sqrt(np.nanmean(np.square(pair), axis=(1, 2, 3), keepdims=True))
+        for cell, maps in zip(axes[:, column], np.moveaxis(pair, 1, 0), strict=True):
+            colours = style.map_colours(mosaic(maps), style.DIVERGING, -LIMIT, LIMIT)
+            style.hide_axes(cell).imshow(colours, interpolation="nearest")
+    for cell, part in zip(axes[:, 0], "xy", strict=True):
+        size = cell.get_images()[0].get_size()[0] / 10
+        labels = [f"{10 * row + 1}\u2013{10 * row + 10}" for row in range(10)]
+        cell.set_yticks((np.arange(10) + 0.5) * size - 0.5, labels)
+        cell.tick_params(length=0, labelsize=7, colors=style.INK)
+        cell.set_ylabel(f"{part} slopes of modes", color=style.INK, fontsize=8.5)
+    limits = (-LIMIT, LIMIT)
+    style.colour_bar(figure, list(axes.ravel()), style.DIVERGING, limits, "slope / rms slope of the mode")
+
+
+def mosaic(maps: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Maps ``(n, rows, columns)`` in rows of ten."""
+    n, height, width = maps.shape
+    return maps.reshape(-1, 10, height, width).swapaxes(1, 2).reshape(n // 10 * height, 10 * width)
 
 
 def draw_correlations(figure: FigureBase, columns: Mapping[str, NDArray[np.float64]]) -> None:
