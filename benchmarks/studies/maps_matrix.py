@@ -50,9 +50,13 @@ ACROSS, LEAST = 28, 0.6e-4
 N_FITTED = 120
 #: Modes compared, as in the paper's figure, and the last mode of each group of the table.
 N_MODES, GROUPS = 100, (10, 30, 60, 100)
+#: Slopes of an actuator below this fraction of the largest in the synthetic matrix are far from it.
+FAR = 0.1
 _FILE, _BASIS = "respM.fits.fz", "full_maps_m2c.fits"
 #: The labels of the three matrices.
 PUBLISHED, TWIN, SYNTHETIC = "published", "twin, DO-CRIME", "synthetic"
+#: The published responses without those far from their actuators.
+NEAR = "near"
 
 
 def illuminated(maps: NDArray[np.float64]) -> NDArray[np.bool_]:
@@ -199,20 +203,28 @@ def main() -> None:
         images = require_kind(result.grid, PyramidPupils)
         twin = measure_twin(settings, estimate.registration, images, options.frames)
     synthetic = model.zonal_matrix(estimate.registration)
+    near = np.abs(synthetic) > FAR * np.abs(synthetic).max(axis=0)
     matrices = {
         label: InteractionMatrix(
             (data @ m2c).astype(np.float32), np.zeros((matrix.n_slopes, N_MODES), np.float32), m2c,
             matrix.valid, config.system.name, "push-pull", label == SYNTHETIC, slope_unit=matrix.slope_unit,
         )
-        for label, data in ((PUBLISHED, matrix.data), (SYNTHETIC, synthetic))
+        for label, data in ((PUBLISHED, matrix.data), (NEAR, matrix.data * near), (SYNTHETIC, synthetic))
     }  # fmt: skip
-    matrices = {PUBLISHED: matrices[PUBLISHED], TWIN: twin, SYNTHETIC: matrices[SYNTHETIC]}
     common = matrix.valid & twin.valid
-    matrices = {label: restrict(one, common) for label, one in matrices.items()}
+    matrices = {label: restrict(one, common) for label, one in {**matrices, TWIN: twin}.items()}
+    published_near = matrices.pop(NEAR)
+    matrices = {label: matrices[label] for label in (PUBLISHED, TWIN, SYNTHETIC)}
     columns = compare(matrices)
+    columns["correlation near synthetic"] = by_mode(published_near, matrices[SYNTHETIC])
     document = {
         **zonal_document(matrix, estimate, synthetic, model.zonal_matrix(Registration())),
         "frames": options.frames, "n_valid_twin": int(twin.valid.sum()), "n_common": int(common.sum()),
+        "near": {
+            "elements": float(near.mean()),
+            "published": float(np.square(matrix.data[near]).sum() / np.square(matrix.data).sum()),
+            "synthetic": float(np.square(synthetic[near]).sum() / np.square(synthetic).sum()),
+        },
         "by group": by_group(columns),
         "by mode": {name: np.round(values, 4).tolist() for name, values in columns.items()},
     }  # fmt: skip

@@ -24,8 +24,8 @@ CURVES = {
 
 def draw(matrices: Mapping[str, InteractionMatrix], columns: Mapping[str, NDArray[np.float64]]) -> Figure:
     """One figure of three parts, from top to bottom."""
-    figure = style.new_figure(8.2, 17.4)
-    whole, curves, maps = figure.subfigures(3, 1, height_ratios=[5.4, 2.2, 8.4])
+    figure = style.new_figure(8.2, 16.2)
+    whole, curves, maps = figure.subfigures(3, 1, height_ratios=[4.75, 1.95, 8.4])
     draw_all_modes(whole, matrices)
     draw_correlations(curves, columns)
     draw_mode_maps(maps, matrices, N_DRAWN)

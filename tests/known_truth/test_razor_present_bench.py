@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -18,8 +19,7 @@ FEW = ["basis.n_modes=30", "calibration.sprint_modes=30", "loop.dropped_modes=0"
 
 def documented_settings() -> list[str]:
     (line,) = (line for line in SYSTEMS.read_text().splitlines() if "416,416" in line)
-    words = shlex.split(line)
-    return [value for option, value in zip(words, words[1:], strict=False) if option == "--set"]
+    return [value for option, value in pairwise(shlex.split(line)) if option == "--set"]
 
 
 def test_the_valid_lenslets_are_those_that_the_pupil_covers() -> None:
@@ -38,7 +38,6 @@ def test_the_injected_registration_is_found_with_452_lenslets() -> None:
         assert system.dm.info.n_act == 97
         assert system.config.devices.wfs.region[2:] == (416, 416)
     assert found.grid.n_valid == 452
-    assert found.grid.pitch_px == pytest.approx(15.62, rel=2e-3)
     injected = system.config.twin.registration.to_registration()
     for name, one in found.registration.parameters().items():
         assert abs(one.value - getattr(injected, name)) < 4 * one.sigma, name
