@@ -11,9 +11,9 @@ covers: 0.28, to a fifth of the radius, are a tenth of the pupil, and 0 is a cle
 nominal one has an exponential profile, as on the RAZOR systems without it. Realisations below 1000 are for
 development; no constant and no method is ever chosen on those from 1000 on, which are for validation. Writes
 ``realisations-SYSTEM-NAME.jsonl``: appends one line per realisation; realisations already in the file are
-skipped. Prints rms error, mean error and normalised chi-squared of those that converged; on a lenslet
-sensor the mean of what the pseudo-synthetic matrix leaves of a noise-free one, in % of it; on a pyramid the
-rms error of the images' mean place in pixels. A realisation takes about half a minute on an idle core.
+skipped. Prints rms error, mean error and normalised chi-squared of those that converged; with --dm97 on a
+lenslet sensor the mean of what the pseudo-synthetic matrix leaves of a noise-free one, in % of it; on a pyramid
+the rms error of the images' mean place in pixels. A realisation takes about half a minute on an idle core.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def run_realisation(system: str, number: int, frames: int, overrides: list[str],
         config = with_measured_mirror(config)
     with System.from_config(config) as bench:
         found = bench.calibrate("escape", frames=frames)
-        agreement = matrix_error(bench, found) if config.sensor.kind == "shack-hartmann" else None
+        agreement = matrix_error(bench, found) if dm97 and config.sensor.kind == "shack-hartmann" else None
     estimate, grid = found.registration, found.grid
     if estimate is None:
         raise RuntimeError("the run ended before a registration was found")
