@@ -12,7 +12,7 @@ nominal one has an exponential profile, as on the RAZOR systems without it. Real
 development; no constant and no method is ever chosen on those from 1000 on, which are for validation. Writes
 ``realisations-SYSTEM-NAME.jsonl``: appends one line per realisation; realisations already in the file are
 skipped. Prints rms error, mean error and normalised chi-squared of those that converged; with --dm97 on a
-lenslet sensor the mean of what the pseudo-synthetic matrix leaves of a noise-free one, in % of it; on a pyramid
+lenslet sensor the mean of what the pseudo-synthetic matrix leaves of a noise-free one, in %; on a pyramid
 the rms error of the images' mean place in pixels. A realisation takes about half a minute on an idle core.
 """
 
