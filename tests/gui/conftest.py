@@ -54,7 +54,9 @@ def timers() -> set[int]:
 
 def widgets() -> dict[int, str]:
     """All widgets by the address of their C++ object, which identifies them."""
-    return {shiboken6.getCppPointer(one)[0]: repr(one) for one in QApplication.allWidgets()}
+    # Older versions of PySide6 also return widgets that were deleted.
+    found = filter(shiboken6.isValid, QApplication.allWidgets())
+    return {shiboken6.getCppPointer(one)[0]: repr(one) for one in found}
 
 
 @pytest.fixture(autouse=True)
