@@ -13,6 +13,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Mapping
 from dataclasses import replace
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from astropy.io import fits
 from maps_matrix_figure import draw
 from matrix_agreement import correlation
 from numpy.typing import NDArray
+from PIL import Image
 from realisation_tables import study_parser
 
 from escape_hw.api.interaction_matrix import InteractionMatrix
@@ -228,7 +230,9 @@ def main() -> None:
         "by group": by_group(columns),
         "by mode": {name: np.round(values, 4).tolist() for name, values in columns.items()},
     }  # fmt: skip
-    (options.out / "maps-matrices.png").write_bytes(style.png(draw(matrices, columns), dpi=140))
+    picture = Image.open(BytesIO(style.png(draw(matrices, columns), dpi=140))).convert("RGB")
+    # A palette makes the file a third as large.
+    picture.quantize(128).save(options.out / "maps-matrices.png", optimize=True)
     (options.out / "maps.json").write_text(dumps(document) + "\n")
     print(dumps({name: value for name, value in document.items() if name != "by mode"}))
 
