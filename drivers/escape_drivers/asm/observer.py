@@ -16,8 +16,8 @@ from escape_hw.errors import FrameTimeout
 class AsmObserver:
     """A connection that receives the mirror's telemetry, health and faults; a context manager.
 
-    Any number of observers may connect. Numbering and sign are those of the hardware. A slow observer gets
-    the newest sample. ``connect_timeout_s`` is the longest wait for a connection and for an answer.
+    Any number of observers may connect. A slow observer gets the newest sample. Numbering and sign are those
+    of the hardware. ``connect_timeout_s`` is the longest wait for a connection and for an answer.
 
     Attributes
     ----------
