@@ -26,8 +26,10 @@ _N_LOBES = 8
 #: a third of them.
 _PROFILE_SIGMA, _FOURFOLD_SIGMA = 0.3, 0.05
 _EDGE_GAIN_SIGMA, _EDGE_WIDTH_SIGMA, _EDGE_PROFILE_SIGMA, _EDGE_ASYMMETRY_SIGMA = 0.2, 0.1, 0.1, 0.1
-#: Changes of registration, in its units, and width below which terms of some per cent of the matrix are kept.
-KEEP_WITHIN = np.array([5.0, 5.0, 0.1, 0.2, 0.2, 0.01])
+#: Changes of registration, in its units, and width below which the four-fold terms, a few per cent of the
+#: matrix, are kept; and derivatives of terms that may be larger on a mirror of another family.
+_KEEP_WITHIN = np.array([5.0, 5.0, 0.1, 0.2, 0.2, 0.01])
+KEEP_DERIVATIVES_WITHIN = _KEEP_WITHIN / 10
 #: Half step of derivatives by position, in % of a sub-aperture.
 _SHIFT_STEP = 2.0
 #: Actuators closer than this many pitches are neighbours.
@@ -99,8 +101,10 @@ class InfluenceShape:
             sigma += [_FOURFOLD_SIGMA] * len(_FOURFOLD_LOBES) + [_EDGE_GAIN_SIGMA, _EDGE_WIDTH_SIGMA]
             sigma += [_EDGE_PROFILE_SIGMA] * n + [_EDGE_ASYMMETRY_SIGMA] * (n + 1)
         self.prior_sigma = np.array(sigma)
-        self._directed_at: NDArray[np.float64] | None = None
-        self._directed: tuple[list[NDArray[np.float64]], list[NDArray[np.float64]]] = [], []
+        self._fourfold_at: NDArray[np.float64] | None = None
+        self._fourfold: list[NDArray[np.float64]] = []
+        self._outward_at: NDArray[np.float64] | None = None
+        self._outward_kept: list[NDArray[np.float64]] = []
 
     @property
     def n_terms(self) -> int:
@@ -132,8 +136,8 @@ class InfluenceShape:
         profile = [one - components[0] for one in components[1:]]
         terms = profile
         if self._edge is not None:
-            fourfold, outward = self._directed_terms(registration, width)
-            terms = terms + fourfold
+            terms = terms + self._fourfold_terms(registration, width)
+            outward = self._outward_terms(registration, width)
             common = _add(nominal, coefficients, terms)
             terms += [self._edge * part for part in (common, width * jacobian[5], *profile, *outward)]
         return ShapedMatrix(nominal, _add(nominal, coefficients, terms), jacobian, terms)
@@ -209,25 +213,16 @@ class InfluenceShape:
         weights += self._shares[:, None] * edge_gain
         return weights, edge_gain
 
-    def _directed_terms(
-        self, registration: Registration, width: float
-    ) -> tuple[list[NDArray[np.float64]], list[NDArray[np.float64]]]:
-        """The terms that have a direction: four-fold ones, and outward asymmetries by width.
-
-        They are a few per cent of the matrix: those of a nearby registration are kept, and the derivatives of
-        the four-fold ones are neglected.
-        """
+    def _outward_terms(self, registration: Registration, width: float) -> list[NDArray[np.float64]]:
+        """Outward asymmetries by width; those of a nearby registration are kept."""
         at = np.append(registration.to_array(), width)
-        if self._directed_at is None or (np.abs(at - self._directed_at) >= KEEP_WITHIN).any():
-            self._directed_at = at
-            self._directed = (
-                self._fourfold_terms(registration, width),
-                [
-                    relative**2 * self._outward_derivative(registration, width * relative)
-                    for relative in PROFILE_WIDTHS
-                ],
-            )
-        return self._directed
+        if self._outward_at is None or (np.abs(at - self._outward_at) >= KEEP_DERIVATIVES_WITHIN).any():
+            self._outward_at = at
+            self._outward_kept = [
+                relative**2 * self._outward_derivative(registration, width * relative)
+                for relative in PROFILE_WIDTHS
+            ]
+        return self._outward_kept
 
     def _outward_derivative(self, registration: Registration, width: float) -> NDArray[np.float64]:
         """Derivative by outward positions of the actuators ``(n_slopes, n_act)``, by central differences."""
@@ -240,7 +235,10 @@ class InfluenceShape:
         return zonal_sum(self._model, moved)
 
     def _fourfold_terms(self, registration: Registration, width: float) -> list[NDArray[np.float64]]:
-        """Lobes along the axes of the mirror less those between them."""
+        """Lobes along the axes of the mirror less those between them; their derivatives are neglected."""
+        at = np.append(registration.to_array(), width)
+        if self._fourfold_at is not None and (np.abs(at - self._fourfold_at) < _KEEP_WITHIN).all():
+            return self._fourfold
         affine, _ = registration.affine(self._model.sub_aperture_m)
         terms = []
         for distance, relative_width in _FOURFOLD_LOBES:
@@ -255,6 +253,7 @@ class InfluenceShape:
                 )
                 lobes.append(((-1.0) ** number, shifted, width * relative_width))
             terms.append(zonal_sum(self._model, lobes))
+        self._fourfold_at, self._fourfold = at, terms
         return terms
 
 

@@ -19,7 +19,7 @@ from escape_hw.api.synthetic_model import HasGainTrend, SyntheticModel
 from escape_hw.calibration.modes.derivatives import modal_matrix, zonal_jacobian
 from escape_hw.calibration.sprint.covariance import LinearisedProblem
 from escape_hw.calibration.sprint.extra_parameters import ExtraParameterModel, FittedExtraParameter
-from escape_hw.calibration.sprint.influence_shape import KEEP_WITHIN, InfluenceShape
+from escape_hw.calibration.sprint.influence_shape import KEEP_DERIVATIVES_WITHIN, InfluenceShape
 from escape_hw.calibration.sprint.normal_equations import NormalEquations, Priors, normal_equations
 from escape_hw.calibration.sprint.weighted_matrix import WeightedMatrix
 from escape_hw.pipeline.statistics import root_mean_square
@@ -103,7 +103,7 @@ class VariantDerivatives:
     def change(self, number: int, registration: Registration, width: float) -> NDArray[np.float32]:
         """Derivatives of a variant less those of the model ``(6, n_slopes, n_act)``."""
         at = np.append(registration.to_array(), width)
-        if self._at is None or (np.abs(at - self._at) >= KEEP_WITHIN).any():
+        if self._at is None or (np.abs(at - self._at) >= KEEP_DERIVATIVES_WITHIN).any():
             self._at, self._base = at, None
             self._changes.clear()
         if number not in self._changes:

@@ -49,8 +49,8 @@ MAX_STEP = np.array([60.0, 60.0, 2.0, 4.0, 4.0])
 _DAMPINGS, _COST_TOLERANCE = (0.0, 1.0, 8.0, 64.0, 512.0, 4096.0, 32768.0), 1.001
 #: A rough fit ends when the cost falls by less than to this factor.
 _ROUGH_CHANGE = 0.999
-#: An extrapolated cost this much above the limit shows that a step is too long.
-_MAX_EXCESS = 1.01
+#: A cost that is extrapolated to so many times the limit shows that a step is too long.
+_MAX_EXCESS = 2.0
 #: Oscillating steps are shortened down to this fraction of the learning rate, and so many times; then the
 #: descent gives up.
 _MIN_RATE_FRACTION, _MAX_REVERSALS = 0.125, 12
