@@ -103,7 +103,7 @@ def measure_twin(
     injected = [f"twin.registration.{name}={value:.6f}" for name, value in values]
     centred = f"twin.pyramid.centre_offsets_px={[[0, 0]] * 4}"
     with open_system("maps-vis", set=[*settings, *injected, centred]) as twin:
-        found = twin.find_sensor().grid
+        found = require_kind(twin.find_sensor().grid, PyramidPupils)
         grid = replace(found, centres_px=images.centres_px, corners_px=images.corners_px)
         return twin.calibrate("docrime", frames=frames, grid=grid).matrix
 
@@ -231,8 +231,8 @@ def main() -> None:
         "by mode": {name: np.round(values, 4).tolist() for name, values in columns.items()},
     }  # fmt: skip
     picture = Image.open(BytesIO(style.png(draw(matrices, columns), dpi=140))).convert("RGB")
-    # A palette makes the file a third as large.
-    picture.quantize(128).save(options.out / "maps-matrices.png", optimize=True)
+    # A palette makes the file a third as large; this one keeps the colours of thin lines.
+    picture.quantize(256, Image.Quantize.MAXCOVERAGE).save(options.out / "maps-matrices.png", optimize=True)
     (options.out / "maps.json").write_text(dumps(document) + "\n")
     print(dumps({name: value for name, value in document.items() if name != "by mode"}))
 

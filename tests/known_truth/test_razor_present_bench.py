@@ -27,6 +27,7 @@ def test_the_valid_lenslets_are_those_that_the_pupil_covers() -> None:
     samples = (np.arange(24 * 20) + 0.5) / 20 - 12
     inside = np.hypot(samples, samples[:, None]) < 24.35 / 2
     covered = inside.reshape(24, 20, 24, 20).mean(axis=(1, 3))
+    assert valid is not None
     assert valid.sum() == 452
     assert np.array_equal(valid, covered > 2 / 3)
 
@@ -38,6 +39,7 @@ def test_the_injected_registration_is_found_with_452_lenslets() -> None:
         assert system.dm.info.n_act == 97
         assert system.config.devices.wfs.region[2:] == (416, 416)
     assert found.grid.n_valid == 452
+    assert found.registration is not None
     injected = system.config.twin.registration.to_registration()
     for name, one in found.registration.parameters().items():
         assert abs(one.value - getattr(injected, name)) < 4 * one.sigma, name
