@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 from realisation_tables import Line, each_realisation, read_lines, study_parser
-from registration_errors import contamination_overrides, print_table, run_realisation
+from registration_errors import print_table, run_realisation
 
 from escape_hw.api.registration import PARAMETERS
 from escape_hw.report.figures.style import SERIES, new_figure, style_axes
@@ -34,8 +34,6 @@ _THIN_PLATE = (
     "devices.dm.influence=gaussian", "devices.dm.coupling=0.4", "twin.mirror.shape=thin-plate",
     "twin.mirror.coupling=0.41", "twin.mirror.wing_fraction=0", "twin.mirror.gain_scatter=0.05",
 )  # fmt: skip
-#: Share of the circumference that dirt covers, to a fifth of the radius: a tenth of the pupil.
-_TENTH = 0.28
 
 
 @dataclass(frozen=True)
@@ -52,19 +50,11 @@ class Case:
 CASES = {
     "dm97-1000": Case("mirrors like a DM97, 1,000 frames", "razor-shwfs", 1000, dm97=True),
     "dm97-50": Case("mirrors like a DM97, 50 frames", "razor-shwfs", 50, dm97=True),
-    "gaussian-1000": Case("Gaussian influence functions, 1,000 frames", "razor-shwfs", 1000, _GAUSSIAN),
     "gaussian-50": Case("Gaussian influence functions, 50 frames", "razor-shwfs", 50, _GAUSSIAN),
     "thin-plate-1000": Case("thin plates, 1,000 frames", "razor-shwfs", 1000, _THIN_PLATE),
     "dm97-1500": Case("mirrors like a DM97, 1,500 frames", "razor-pywfs", 1500, dm97=True),
     "revolt-2000": Case("as bundled, 2,000 frames", "revolt-shwfs", 2000),
     "nir-1500": Case("as bundled, 1,500 frames", "maps-nir", 1500),
-    "nir-clean-1500": Case(
-        "clean and evenly lit, 1,500 frames", "maps-nir", 1500, tuple(contamination_overrides(0.0))
-    ),
-    "nir-tenth-1500": Case(
-        "a tenth of the pupil contaminated, 1,500 frames", "maps-nir", 1500,
-        tuple(contamination_overrides(_TENTH)),
-    ),
     "vis-1500": Case("as bundled, 1,500 frames", "maps-vis", 1500),
 }  # fmt: skip
 
