@@ -108,11 +108,12 @@ def _fit_offset(
     for iteration in range(_ITERATIONS):
         model = _linearise(pixels, _shadow_map(shadow, diameter, softness), offset)
         if iteration == _ITERATIONS // 2:
-            # What the wrong offset and softness leave would otherwise count as unevenness.
+            # What a wrong offset, softness and size leave would otherwise count as unevenness.
             scales = unevenness.find_scales(model)
-        change, step, covariance = unevenness.fit(model, scales)
+        changes, step, covariance = unevenness.fit(model, scales)
         offset = offset + np.clip(step, -_MAX_STEP, _MAX_STEP)
-        softness *= float(np.clip(1 + _SOFTNESS_CHANGE * change, 0.7, 1.4))
+        softness *= float(np.clip(1 + changes[0], 0.7, 1.4))
+        diameter *= float(np.clip(1 + changes[1], 0.9, 1.1))
     return offset, float(np.sqrt(np.trace(covariance) / 2))
 
 
@@ -129,8 +130,9 @@ def _select_pixels(image: NDArray[np.float64], centres: NDArray[np.float64], dia
 
 
 def _shadow_map(shadow: Shadow, diameter: float, softness: float) -> NDArray[np.float64]:
-    """Map ``(4, n, n)`` of the light that a pixel loses, and of its derivatives: softness, and offset (x, y).
+    """Map ``(5, n, n)`` of the light that a pixel loses, and of its derivatives.
 
+    The derivatives are those with respect to relative changes of softness and size, and to the offset (x, y).
     As a function of the position of the pixel from the shadow's centre, with :data:`_OVERSAMPLING` samples
     per pixel.
     """
@@ -142,13 +144,16 @@ def _shadow_map(shadow: Shadow, diameter: float, softness: float) -> NDArray[np.
         for change in (1, 1 + _SOFTNESS_CHANGE)
     )
     by_y, by_x = np.gradient(seen, 1 / _OVERSAMPLING)
-    return np.stack([seen, softer - seen, -by_x, -by_y])
+    px = at * diameter
+    larger = -(by_x * px + by_y * px[:, None])
+    return np.stack([seen, (softer - seen) / _SOFTNESS_CHANGE, larger, -by_x, -by_y])
 
 
 def _linearise(pixels: _Pixels, shadow_map: NDArray[np.float64], offset: NDArray[np.float64]) -> _LinearModel:
     """Linearise the model of the relative light about an offset.
 
-    The unknowns are the level and the light within the shadow of each image, the softness, and the offset.
+    The unknowns are the level and the light within the shadow of each image, and softness, size and offset of
+    the shadow. A wrong size in uneven light would be taken for an offset.
     """
     places = np.stack([pixels.y - offset[1], pixels.x - offset[0]]) * _OVERSAMPLING + shadow_map.shape[1] // 2
     dark, *moving = (ndimage.map_coordinates(part, places, order=1) for part in shadow_map)
@@ -189,10 +194,10 @@ class _Unevenness:
 
     def fit(
         self, model: _LinearModel, scales: NDArray[np.float64]
-    ) -> tuple[float, NDArray[np.float64], NDArray[np.float64]]:
-        """Generalised least squares: softness, offset ``(2,)``, and covariance ``(2, 2)`` of the offset."""
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Generalised least squares: softness and size ``(2,)``, offset ``(2,)``, its covariance."""
         solution, covariance, _ = self._solve(model, scales)
-        return float(solution[-3]), solution[-2:], covariance[-2:, -2:]
+        return solution[-4:-2], solution[-2:], covariance[-2:, -2:]
 
     def _solve(
         self, model: _LinearModel, scales: NDArray[np.float64]
