@@ -54,9 +54,7 @@ def timers() -> set[int]:
 
 def widgets() -> dict[int, str]:
     """All widgets by the address of their C++ object, which identifies them."""
-    # Older versions of PySide6 also return widgets that were deleted.
-    found = filter(shiboken6.isValid, QApplication.allWidgets())
-    return {shiboken6.getCppPointer(one)[0]: repr(one) for one in found}
+    return {shiboken6.getCppPointer(one)[0]: repr(one) for one in QApplication.allWidgets()}
 
 
 @pytest.fixture(autouse=True)
