@@ -53,7 +53,7 @@ def timers() -> set[int]:
 
 
 def widgets() -> dict[int, str]:
-    """All widgets by the address of their C++ object, which identifies them; without Qt's own of the desktop."""
+    """All widgets but Qt's own of the desktop, by the address of their C++ object, which identifies them."""
     found = (one for one in QApplication.allWidgets() if one.windowType() != Qt.WindowType.Desktop)
     return {shiboken6.getCppPointer(one)[0]: repr(one) for one in found}
 
