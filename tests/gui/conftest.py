@@ -14,7 +14,7 @@ os.environ.setdefault("QT_QPA_PLATFORM", "offscreen")
 
 import shiboken6
 from gui_windows import dispose, settle, show_window
-from PySide6.QtCore import QTimer
+from PySide6.QtCore import Qt, QTimer
 from PySide6.QtWidgets import QApplication
 from scripted import ScriptedControl, ScriptedSource
 
@@ -53,9 +53,8 @@ def timers() -> set[int]:
 
 
 def widgets() -> dict[int, str]:
-    """All widgets by the address of their C++ object, which identifies them."""
-    # Older versions of PySide6 also return widgets that were deleted.
-    found = filter(shiboken6.isValid, QApplication.allWidgets())
+    """All widgets but Qt's own of the desktop, by the address of their C++ object, which identifies them."""
+    found = (one for one in QApplication.allWidgets() if one.windowType() != Qt.WindowType.Desktop)
     return {shiboken6.getCppPointer(one)[0]: repr(one) for one in found}
 
 
