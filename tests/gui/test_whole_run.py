@@ -81,7 +81,7 @@ def test_escape_on_the_shack_hartmann_bench(tmp_path: Path) -> None:
 def test_escape_and_gains_on_the_pyramid_bench(tmp_path: Path) -> None:
     with operating("razor-pywfs", tmp_path) as operator:
         operator.take_control()
-        calibrated(operator, operator.run("escape", frames="1500"))
+        calibrated(operator, operator.run("escape", frames="3000"))
         ended = operator.run("gains", frames="600", accuracy="0.2", strehl="False")
         assert ended.finish is Finish.DONE, ended.message
         gains = operator.window.panels["gains"]

@@ -40,9 +40,9 @@ PLACES = {
     "model PSF": ((*LOOP, *SLOW), "model PSF", 0, [], []),
     "best gain": ((*LOOP, "--best-gain", "--no-strehl", *SLOW), "loop at gain", 0.2, [], ["loop"]),
     "closed loop": ((*LOOP, "--frames", ENDLESS), "closed loop", 0.5, [], ["loop"]),
-    "reproduce, push-pull": (SHWFS, "push-pull", 0.2, [], ["push_pull"]),
-    "reproduce, DO-CRIME": (
-        (*SHWFS, "--frames", ENDLESS), "DO-CRIME", 0.8, ["push_pull"], ["docrime"],
+    "reproduce, DO-CRIME": ((*SHWFS, "--frames", ENDLESS), "DO-CRIME", 0.8, [], ["docrime"]),
+    "reproduce, push-pull": (
+        (*SHWFS, "--frames", 400), "push-pull", 0.2, ["docrime", "escape"], ["push_pull"],
     ),
     "reproduce, closed loop": (
         (*SHWFS, "--frames", 400, "--loop-frames", ENDLESS), "closed loop", 0.5,
