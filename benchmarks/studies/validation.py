@@ -115,7 +115,7 @@ def page(tables: dict[str, list[Line]]) -> str:
 
 def draw(tables: dict[str, list[Line]], target: Path) -> None:
     """Errors of all realisations in their standard errors, a row of points per parameter."""
-    figure = new_figure(8.0, 0.9 + 0.95 * len(tables))
+    figure = new_figure(8.0, 0.9 + 1.15 * len(tables))
     for axes, (name, rows) in zip(
         np.atleast_1d(figure.subplots(len(tables), 1)), tables.items(), strict=True
     ):
@@ -124,9 +124,9 @@ def draw(tables: dict[str, list[Line]], target: Path) -> None:
             pulls = [row["error"][k] / row["sigma"][k] for row in rows if row["converged"]]
             axes.plot(pulls, np.full(len(pulls), -k), ".", color=SERIES[0], ms=5, alpha=0.6)
             axes.text(-6.4, -k, parameter.replace("_", " "), ha="right", va="center", fontsize=7)
-        axes.set(xlim=(-6.2, 6.2), ylim=(-4.6, 0.6), yticks=[], title="")
+        axes.set(xlim=(-6.2, 6.2), ylim=(-4.6, 0.6), yticks=[])
         axes.axvspan(-1, 1, color=SERIES[0], alpha=0.08, lw=0)
-        axes.text(6.1, 0.1, f"{CASES[name].system}: {CASES[name].title}", ha="right", va="center", fontsize=7)
+        axes.set_title(f"{CASES[name].system}, {CASES[name].title}", loc="left", fontsize=8)
     axes.set_xlabel("error [standard errors]")
     figure.savefig(target, dpi=110, facecolor="white")
 
