@@ -331,5 +331,5 @@ def _pairs_of(info: DMInfo) -> NDArray[np.intp]:
 def _renumber(actuators: Iterable[int], numbers: NDArray[np.intp] | None) -> tuple[int, ...]:
     if numbers is None:
         return tuple(sorted(actuators))
-    # A number beyond those of the layout is reported as it is: it is another mirror.
+    # Numbers beyond the layout are passed on unchanged: the check of the number of actuators reports them.
     return tuple(sorted(int(numbers[k]) if k < numbers.size else k for k in actuators))

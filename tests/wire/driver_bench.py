@@ -44,7 +44,7 @@ def configuration_of(driver: str, *more: str, system: str = "razor-shwfs") -> Sy
 
 
 def make(driver: str, *more: str, system: str = "razor-shwfs") -> Any:
-    """A device of the system, not open, on the stand-in as it is."""
+    """A closed device of the system, on an unmodified stand-in."""
     config, key = configuration_of(driver, *more, system=system), PARTS[driver][0]
     section = getattr(config.devices, key)
     return device_factory(driver, hardware=True)(section, DeviceContext(key, config))

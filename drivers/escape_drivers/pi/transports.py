@@ -257,7 +257,7 @@ class UsbTransport:
                 self._device.detach_kernel_driver(number)
                 self._detached.append(number)
         except NotImplementedError:
-            # pyusb's word for a backend without kernel drivers: there is none to take the controller from.
+            # pyusb raises this where the backend has no kernel drivers, so that none has to be detached.
             log.debug("%s: this USB backend has no kernel drivers", self.where)
         usb.util.claim_interface(self._device, number)
         for endpoint in interface:

@@ -76,20 +76,10 @@ def zonal_sum(
 def zonal_components(
     model: SyntheticModel, registration: Registration, width: float, functions: Sequence[tuple[float, float]]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Slopes of influence functions of several widths, and derivatives of their sum, per unit command.
+    """Slopes of influence functions of several widths, and derivatives of their sum.
 
-    Parameters
-    ----------
-    registration, width
-        Registration, and the width that all functions are multiples of.
-    functions
-        Factor in the sum and relative width of each.
-
-    Returns
-    -------
-    matrices : ndarray, ``(n_functions, n_slopes, n_act)``
-        Without the factors.
-    derivatives : ndarray, ``(6, n_slopes, n_act)``
+    Shapes and arguments are those of
+    :meth:`~escape_hw.api.synthetic_model.SummingModel.zonal_components`.
     """
     if isinstance(model, SummingModel):
         return model.zonal_components(registration, width, functions)
