@@ -15,7 +15,6 @@ from escape_hw.runtime.host.computer import Host, route_to
 from escape_hw.runtime.host.discovery import discover
 from escape_sim.emulators.asm.emulator import make_emulator
 
-NOBODY = 65534
 RULES = (udev.find_packaged_files() / "70-escape.rules").read_text()
 
 
