@@ -1,13 +1,16 @@
 """Error of the registration by the size of the pokes, on a Shack-Hartmann twin without noise and turbulence.
 
     python benchmarks/studies/lenslet_pokes.py --out docs/studies/lenslet-pokes
+    python benchmarks/studies/lenslet_pokes.py --out docs/studies/lenslet-pokes --settling 0.17
 
 The mirror equals the nominal one, and slopes are computed from images without noise, so that only the
 response of the spots to the pokes differs from the synthetic model. Random pokes of all modes, a fraction of
 those of the configuration, are regressed as DO-CRIME does, and SPRINT fits the result: with weights averaged
 over uniform tilts of each lenslet alone, and with weights averaged over the wavefronts of random pokes of the
-same rms as well. Writes ``SYSTEM.jsonl`` with a line per realisation of the pokes
-and fraction.
+same rms as well. With ``--settling`` the mirror goes from each poke to the next during the exposure,
+exponentially with this time constant in exposures; SPRINT then fits also with the delay that DO-CRIME would
+find, from which it knows the share of the poke before. Writes ``SYSTEM.jsonl`` (``SYSTEM-settling.jsonl``)
+with a line per realisation of the pokes and fraction.
 """
 
 from __future__ import annotations
@@ -33,6 +36,10 @@ from escape_sim.models.shack_hartmann import ShackHartmannModel
 
 #: Fractions of the configured poke.
 FRACTIONS = (0.25, 0.5, 1.0)
+#: Fits: weights around tilts, around pokes, and around pokes of a mirror that settles.
+LABELS = ("nominal", "pokes", "settling")
+#: Times during an exposure at which the image of a mirror that settles is computed.
+N_TIMES = 8
 #: Counts of the brightest pixel on a flat wavefront.
 PEAK_COUNTS = 150.0
 IDEAL = (
@@ -43,18 +50,28 @@ IDEAL = (
 
 
 class Measurement:
-    """Regression of noiseless slopes on random pokes ``(n, n_modes)``."""
+    """Regression of noiseless slopes on random pokes ``(n, n_modes)``.
 
-    def __init__(self, bench: System, pokes: NDArray[np.float64]) -> None:
+    ``settling`` is the time constant of the mirror in exposures, 0 for one that is at rest.
+    """
+
+    def __init__(self, bench: System, pokes: NDArray[np.float64], settling: float = 0.0) -> None:
         self._twin, self._bench = get_simulated_bench(bench), bench
         height, width = bench.config.devices.wfs.region[:1:-1]
         self._shape, self.m2c = (height, width), build_modal_basis(bench)
         scale = PEAK_COUNTS / self._image(np.zeros(len(self.m2c))).max()
-        mean = np.mean([self._image(self.m2c @ poke) for poke in pokes[:300]], axis=0)
+        before = np.roll(pokes, 1, axis=0)
+        times = (np.arange(N_TIMES) + 0.5) / N_TIMES
+        rest = np.exp(-times / settling) if settling else np.zeros(1)
+        images = [self._exposure(*pair, rest) for pair in zip(before, pokes, strict=True)]
+        mean = np.mean(images[:300], axis=0)
         grid = build_sensor_setup(bench, (mean * scale).astype(np.float32)).grid
         slopes_of = build_slope_function(bench, grid)
-        slopes = np.array([slopes_of(self._image(self.m2c @ poke) * scale).copy() for poke in pokes], float)
+        slopes = np.array([slopes_of(image * np.float32(scale)).copy() for image in images], float)
         slopes -= slopes.mean(axis=0)
+        #: Mean share of the poke before.
+        self.overlap = float(rest.mean())
+        pokes = np.asarray(pokes + self.overlap * (before - pokes), float)
         response = np.linalg.lstsq(pokes, slopes, rcond=None)[0]
         scatter = (slopes - pokes @ response).var(axis=0)
         sigma = np.sqrt(np.outer(scatter, 1 / np.square(pokes).sum(axis=0)))
@@ -66,6 +83,16 @@ class Measurement:
             raise SystemExit("this study is for Shack-Hartmann sensors")
         rms = float(np.sqrt(np.square(pokes).sum(axis=1).mean()))
         self.grid = grid.with_slope_statistics(motion, rms)
+
+    def _exposure(
+        self, before: NDArray[np.float64], poke: NDArray[np.float64], rest: NDArray[np.float64]
+    ) -> NDArray[np.float32]:
+        images = [self._image(self.m2c @ (poke + share * (before - poke))) for share in rest]
+        return np.asarray(np.mean(images, axis=0), np.float32)
+
+    def matrix_with_delay(self) -> InteractionMatrix:
+        """The matrix with the delay that contains the share of the poke before."""
+        return replace(self.matrix, metrics={**self.matrix.metrics, "delay_frames": 1 + self.overlap})
 
     def _image(self, command: NDArray[np.float64]) -> NDArray[np.float32]:
         image = np.zeros(self._shape, np.float32)
@@ -82,7 +109,12 @@ class Measurement:
 
 
 def run_realisation(
-    system: str, number: int, n_pokes: int, overrides: list[str], fractions: tuple[float, ...] = FRACTIONS
+    system: str,
+    number: int,
+    n_pokes: int,
+    overrides: list[str],
+    fractions: tuple[float, ...] = FRACTIONS,
+    settling: float = 0.0,
 ) -> Line:
     """Errors of the registration by fraction of the poke, with either model."""
     rng, rows = np.random.default_rng(number), []
@@ -93,11 +125,16 @@ def run_realisation(
         amplitude = compute_random_amplitudes(bench, build_modal_basis(bench), bench.config.calibration.poke)
         for fraction in fractions:
             pokes = rng.uniform(-1, 1, (n_pokes, amplitude.size)) * amplitude * fraction
-            measured = Measurement(bench, pokes)
+            measured = Measurement(bench, pokes, settling)
             row: Line = {"fraction": fraction, "motion_px": measured.grid.motion_px}
-            models = {"nominal": measured.model(), "pokes": measured.model_with_pokes()}
-            for label, model in models.items():
-                found = sprint(measured.matrix, model, start=injected, coarse_search=False)
+            fits = {
+                "nominal": (measured.matrix, measured.model()),
+                "pokes": (measured.matrix, measured.model_with_pokes()),
+            }
+            if settling:
+                fits["settling"] = (measured.matrix_with_delay(), measured.model_with_pokes())
+            for label, (matrix, model) in fits.items():
+                found = sprint(matrix, model, start=injected, coarse_search=False)
                 row[label] = {
                     "error": (found.registration.to_array() - injected.to_array()).tolist(),
                     "sigma": found.sigma.tolist(), "gain": found.gain.value,
@@ -109,7 +146,7 @@ def run_realisation(
 def print_table(rows: list[Line]) -> None:
     """Mean error of the shifts in % of a sub-aperture, by fraction and model."""
     for k, fraction in enumerate(FRACTIONS):
-        for label in ("nominal", "pokes"):
+        for label in (one for one in LABELS if one in rows[0]["fractions"][k]):
             errors = np.array([row["fractions"][k][label]["error"][:2] for row in rows])
             print(fraction, label, np.round(errors.mean(axis=0), 3).tolist())
 
@@ -118,14 +155,20 @@ def main() -> None:
     """Measure what is missing, and print the table."""
     parser = study_parser(__doc__, "revolt-shwfs", 1)
     parser.add_argument("--pokes", type=int, default=1500)
+    parser.add_argument("--settling", type=float, default=0.0, help="time constant in exposures")
     parser.add_argument("--set", dest="overrides", nargs="*", default=[])
     options = parser.parse_args()
     rows = each_realisation(
-        options.out / f"{options.system}.jsonl",
-        {"system": options.system, "pokes": options.pokes, "set": options.overrides},
+        options.out / f"{options.system}{'-settling' if options.settling else ''}.jsonl",
+        {
+            "system": options.system, "pokes": options.pokes, "set": options.overrides,
+            "settling": options.settling,
+        },
         realisation_numbers(options),
-        lambda number: run_realisation(options.system, number, options.pokes, options.overrides),
-    )
+        lambda number: run_realisation(
+            options.system, number, options.pokes, options.overrides, settling=options.settling
+        ),
+    )  # fmt: skip
     print_table(rows)
 
 

@@ -186,11 +186,14 @@ class HasPupilShift(Protocol):
 class HasPokeResponse(Protocol):
     """A model whose response depends on the shapes of the random pokes of the measurement."""
 
-    def around_pokes(self, registration: Registration, m2c: NDArray[np.float64]) -> SyntheticModel | None:
+    def around_pokes(
+        self, registration: Registration, m2c: NDArray[np.float64], overlap: float
+    ) -> SyntheticModel | None:
         """The model whose response is the mean around random pokes of modes ``m2c (n_act, n_modes)``.
 
         ``None`` if that makes no difference, or the measurement had no random pokes. The registration is
-        where the pokes are computed, not that of the model returned.
+        where the pokes are computed, not that of the model returned. ``overlap`` is the share of an exposure
+        during which the mirror still has the poke before.
         """
 
 

@@ -51,6 +51,7 @@ def slope_weights(
     grid: SubApertureGrid,
     pupil: PupilGeometry,
     wavefronts_m: Sequence[NDArray[np.floating]] = (),
+    overlap: float = 0.0,
 ) -> dict[tuple[int, int], NDArray[np.float64]]:
     """Mean derivative of each slope by the optical path on its lenslet and on the eight around it.
 
@@ -66,7 +67,8 @@ def slope_weights(
 
     With ``wavefronts_m``, optical paths ``(n, n)`` in metres over the pupil, the derivative is averaged over
     these as well: each is added to a spot motion. Pokes of a mirror with about one actuator per lenslet are
-    not tilts of whole lenslets (docs/studies/lenslet-pokes.md).
+    not tilts of whole lenslets (docs/studies/lenslet-pokes.md). ``overlap`` is the mean share of the
+    wavefront before during an exposure, whose light is added (:func:`exposure_parts`).
 
     Returns
     -------
@@ -84,23 +86,54 @@ def slope_weights(
     nodes = max(len(shifts), len(wavefronts_m))
     for node in range(nodes):
         moved = window_images.moved(shifts[node % len(shifts)], blur[node % len(shifts)])
-        phasors = dict.fromkeys(NEIGHBOURS, moved)
+        exposure = [(1.0, 1.0, dict.fromkeys(NEIGHBOURS, moved))]
         if len(wavefronts_m):
-            around = _neighbour_phasors(grid, pupil, wave * wavefronts_m[node % len(wavefronts_m)])
-            phasors = {step: moved * phasor for step, phasor in around.items()}
-        window_images.accumulate(out, phasors, 1 / nodes)
+            wavefront = wavefronts_m[node % len(wavefronts_m)]
+            # The wavefront one lattice earlier is independent, and as symmetric as this one.
+            before = wavefronts_m[(node - len(shifts)) % len(wavefronts_m)]
+            exposure = [
+                (share, weight, _neighbour_phasors(grid, pupil, wave * one, moved))
+                for share, weight, one in exposure_parts(before, wavefront, overlap)
+            ]
+        window_images.accumulate(out, exposure, 1 / nodes)
     return {step: block * wave for step, block in out.items()}
 
 
+def exposure_parts(
+    before: NDArray[np.floating], now: NDArray[np.floating], overlap: float
+) -> list[tuple[float, float, NDArray[np.floating]]]:
+    """Parts of an exposure while a mirror goes from one poke to the next: shares, weights, wavefronts.
+
+    ``overlap`` is the mean share of the wavefront before. A mirror that settles exponentially within the
+    exposure leaves half of that in the mean square, as one does that is half-way for twice that time. The
+    weights are those of the derivatives in a regression on pokes that are mixed in the same ratio.
+    """
+    if not overlap:
+        return [(1.0, 1.0, now)]
+    rest = max(0.5, overlap)
+    power = (1 - overlap) ** 2 + overlap**2
+    return [
+        (share, share * ((1 - overlap) * (1 - r) + overlap * r) / power, now + r * (before - now))
+        for share, r in ((overlap / rest, rest), (1 - overlap / rest, 0.0))
+    ]
+
+
 def _neighbour_phasors(
-    grid: SubApertureGrid, pupil: PupilGeometry, phase: NDArray[np.floating]
-) -> dict[tuple[int, int], NDArray[np.complex64]]:
-    """Phasors ``(n_valid, p, p)`` of a phase over the pupil on the lenslets at each step from a window."""
+    grid: SubApertureGrid,
+    pupil: PupilGeometry,
+    phase: NDArray[np.floating],
+    moved: NDArray[np.complexfloating],
+) -> dict[tuple[int, int], NDArray[np.complexfloating]]:
+    """Phasors ``(n_valid, p, p)`` of a phase over the pupil on the lenslets at each step from a window.
+
+    Multiplied by the phasors ``moved``, the same on all lenslets around a window.
+    """
     n, p = pupil.n_sub, pupil.n_pix
     rows, columns = np.nonzero(grid.valid)
     phasor = np.exp(1j * phase.reshape(n, p, n, p).transpose(0, 2, 1, 3)).astype(np.complex64)
     return {
-        (i, j): phasor[np.clip(rows + i, 0, n - 1), np.clip(columns + j, 0, n - 1)] for i, j in NEIGHBOURS
+        (i, j): moved * phasor[np.clip(rows + i, 0, n - 1), np.clip(columns + j, 0, n - 1)]
+        for i, j in NEIGHBOURS
     }
 
 
@@ -223,18 +256,23 @@ class _WindowImages:
     def accumulate(
         self,
         out: dict[tuple[int, int], NDArray[np.float64]],
-        phasors: Mapping[tuple[int, int], NDArray[np.complexfloating]],
+        exposure: Sequence[tuple[float, float, Mapping[tuple[int, int], NDArray[np.complexfloating]]]],
         share: float,
     ) -> None:
-        """Add ``share`` times the derivatives for the phasors ``(n_valid, p, p)`` of each neighbour."""
-        fields = {}
+        """Add ``share`` times the derivatives for an exposure.
+
+        It has one or several parts: their shares of the light, the weights of their derivatives, and the
+        phasors ``(n_valid, p, p)`` of each neighbour.
+        """
+        fields = []
         image = np.zeros(self._inside.shape, self._real)
-        for step in NEIGHBOURS:
-            fy, fx = self._along[step]
-            amplitude = self._blocks[step] * phasors[step]
-            e = np.matmul(np.matmul(fy.transpose(0, 2, 1), amplitude), fx)
-            image += e.real**2 + e.imag**2
-            fields[step] = (amplitude, e)
+        for part, weight, phasors in exposure:
+            for step in NEIGHBOURS:
+                fy, fx = self._along[step]
+                amplitude = self._blocks[step] * phasors[step]
+                e = np.matmul(np.matmul(fy.transpose(0, 2, 1), amplitude), fx)
+                image += self._real.type(part) * (e.real**2 + e.imag**2)
+                fields.append((step, weight, amplitude, e))
         counted, above_threshold = self._apply_threshold(image)
         total = np.maximum(counted.sum(axis=(1, 2)), 1e-30)
         x, y = self._columns_at[:, None, :], self._rows_at[:, :, None]
@@ -243,10 +281,10 @@ class _WindowImages:
             moment_arm = (
                 (at - centroid[:, None, None]) * above_threshold * (share / total)[:, None, None]
             ).astype(self._real)
-            for step, (amplitude, e) in fields.items():
+            for step, weight, amplitude, e in fields:
                 fy, fx = self._along[step]
                 back_propagated = np.matmul(np.matmul(fy, moment_arm * e.conj()), fx.transpose(0, 2, 1))
-                out[step][axis] += -2 * np.imag(amplitude * back_propagated)
+                out[step][axis] += -2 * weight * np.imag(amplitude * back_propagated)
 
     def _apply_threshold(
         self, image: NDArray[np.floating]
@@ -451,6 +489,7 @@ class ShackHartmannModel(DesignModel):
         config: SystemConfig,
         grid: SubApertureGrid,
         wavefronts_m: Sequence[NDArray[np.floating]] = (),
+        overlap: float = 0.0,
     ) -> None:
         super().__init__(config, pupil_geometry(config))
         if grid.valid.shape != (self._pupil.n_sub, self._pupil.n_sub):
@@ -461,13 +500,13 @@ class ShackHartmannModel(DesignModel):
         self._opd_per_command_m = 2 * config.devices.dm.stroke_m
         self._grid = grid
         self._variants: list[ShackHartmannModel] | None = None
-        self._wavefronts_m = tuple(wavefronts_m)
+        self._wavefronts_m, self._overlap = tuple(wavefronts_m), overlap
         self._around_pokes: tuple[Registration, ShackHartmannModel] | None = None
 
     @cached_property
     def _slopes(self) -> SlopeOperator:
         """Slopes of wavefronts; the modal basis, for which models are made too, needs none."""
-        weights = slope_weights(self._config, self._grid, self._pupil, self._wavefronts_m)
+        weights = slope_weights(self._config, self._grid, self._pupil, self._wavefronts_m, self._overlap)
         return SlopeOperator(weights, self._grid.valid, self._pupil.sub_aperture_m)
 
     def influence_functions(self) -> tuple[NDArray[np.float64], NDArray[np.bool_], float]:
@@ -583,15 +622,17 @@ class ShackHartmannModel(DesignModel):
             larger = 1 + self._config.sensor_as(ShackHartmannSection).motion_sigma
             grid = replace(self._grid, motion_px=self._grid.motion_px * larger)
             wavefronts = [larger * one for one in self._wavefronts_m]
-            varied = ShackHartmannModel(self._config, grid, wavefronts)
+            varied = ShackHartmannModel(self._config, grid, wavefronts, self._overlap)
             self._variants = [varied] if grid.motion_px or wavefronts else []
         return list(self._variants)
 
-    def around_pokes(self, registration: Registration, m2c: NDArray[np.float64]) -> ShackHartmannModel | None:
+    def around_pokes(
+        self, registration: Registration, m2c: NDArray[np.float64], overlap: float
+    ) -> ShackHartmannModel | None:
         """The model around random pokes, see :class:`HasPokeResponse`.
 
         The pokes are drawn with equal amplitudes of all modes and the measured rms; the rest of the measured
-        motion of the spots is tilts.
+        motion of the spots, at least that of turbulence, is tilts.
         """
         grid, n_modes = self._grid, m2c.shape[1]
         if not grid.pokes or self._gaussian.pitch_m > _MAX_PITCH * self.sub_aperture_m:
@@ -608,9 +649,12 @@ class ShackHartmannModel(DesignModel):
         # Opposite nodes of the spot motion have opposite pokes.
         blocks = half.reshape(len(half), _N_POKES, -1)
         pokes = np.concatenate([blocks, -blocks[:, :, ::-1]], axis=2).reshape(len(half), -1)
-        poke_motion = float(self.modal_matrix(registration, half).std())
-        rest = float(np.sqrt(max(0.0, grid.motion_px**2 - poke_motion**2)))
+        mean_square = (1 - overlap) ** 2 + overlap**2
+        poke_variance = mean_square * float(self.modal_matrix(registration, half).var())
+        rest = max(grid.turbulence_px, float(np.sqrt(max(0.0, grid.motion_px**2 - poke_variance))))
         paths = np.tensordot(pokes.T * self._opd_per_command_m, surfaces, 1)
-        model = ShackHartmannModel(self._config, replace(grid, motion_px=rest, pokes=0.0), tuple(paths))
+        model = ShackHartmannModel(
+            self._config, replace(grid, motion_px=rest, pokes=0.0), tuple(paths), overlap
+        )
         self._around_pokes = registration, model
         return model
