@@ -18,13 +18,13 @@ from pathlib import Path
 
 import numpy as np
 from realisation_tables import Line, each_realisation, read_lines, study_parser
-from registration_errors import print_table, run_realisation
+from registration_errors import contamination_overrides, print_table, run_realisation
 
 from escape_hw.api.registration import PARAMETERS
 from escape_hw.report.figures.style import SERIES, new_figure, style_axes
 
 #: No constant and no method was chosen on these.
-REALISATIONS = range(2000, 2020)
+REALISATIONS = range(3000, 3020)
 #: The mirror of the bundled benches until version 0.2.0.
 _GAUSSIAN = (
     "devices.dm.influence=gaussian", "devices.dm.coupling=0.4", "twin.mirror.shape=gaussian",
@@ -55,6 +55,13 @@ CASES = {
     "dm97-1500": Case("mirrors like a DM97, 1,500 frames", "razor-pywfs", 1500, dm97=True),
     "revolt-2000": Case("as bundled, 2,000 frames", "revolt-shwfs", 2000),
     "nir-1500": Case("as bundled, 1,500 frames", "maps-nir", 1500),
+    "nir-clean-1500": Case(
+        "clean and evenly lit, 1,500 frames", "maps-nir", 1500, tuple(contamination_overrides(0.0))
+    ),
+    "nir-tenth-1500": Case(
+        "a tenth of the pupil contaminated, 1,500 frames", "maps-nir", 1500,
+        tuple(contamination_overrides(0.28)),
+    ),
     "vis-1500": Case("as bundled, 1,500 frames", "maps-vis", 1500),
 }  # fmt: skip
 
