@@ -6,6 +6,7 @@ mirror surfaces.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
@@ -502,6 +503,7 @@ class ShackHartmannModel(DesignModel):
         self._variants: list[ShackHartmannModel] | None = None
         self._wavefronts_m, self._overlap = tuple(wavefronts_m), overlap
         self._around_pokes: tuple[Registration, ShackHartmannModel] | None = None
+        self._anisotropy = 0.0
 
     @cached_property
     def _slopes(self) -> SlopeOperator:
@@ -523,6 +525,26 @@ class ShackHartmannModel(DesignModel):
 
     def zonal_matrix(self, registration: Registration, width: float = 1.0) -> NDArray[np.float64]:
         """Slopes in pixels per unit command ``(n_slopes, n_act)``, see :class:`SyntheticModel`."""
+        matrix = self._isotropic_matrix(registration, width)
+        return matrix + self._anisotropic_part(registration, width) if self._anisotropy else matrix
+
+    def _anisotropic_part(self, registration: Registration, width: float) -> NDArray[np.float64]:
+        """Change of the matrix where functions are wider along each slope, and narrower across it.
+
+        That of Gaussians for mirrors of any other shape and for anamorphosis in any direction.
+        """
+        model = self if isinstance(self._nominal, InfluenceFunctions) else self.component_model()
+        upright = replace(registration, anamorphosis_angle=0.0)
+        factors = model._factors(  # noqa: SLF001
+            self._slopes.nodes_m, upright, width, derivatives=True
+        )
+        parts = factors.sum_terms(self._slopes.zonal(factors, derivatives=True))
+        half = self._grid.n_valid
+        change = (parts[3] - parts[4]).astype(float)
+        change[half:] *= -1
+        return change * (self._anisotropy * self._opd_per_command_m)
+
+    def _isotropic_matrix(self, registration: Registration, width: float) -> NDArray[np.float64]:
         if not self._is_separable(registration):
             surfaces = np.moveaxis(self._surfaces(self._slopes.nodes_m, registration, width), 0, 2).copy()
             return np.asarray(self._slopes.slopes(surfaces) * self._opd_per_command_m)
@@ -617,13 +639,23 @@ class ShackHartmannModel(DesignModel):
         return self._grid.numbering_offsets
 
     def variants(self) -> list[ShackHartmannModel]:
-        """The model with motion and pokes larger by the motion's uncertainty, see :class:`SyntheticModel`."""
+        """Models of a sensor that differs, see :class:`SyntheticModel`.
+
+        One has motion and pokes larger by the motion's uncertainty. To the other, x slopes see influence
+        functions wider along x and narrower along y, and y slopes the other way round. Turbulence does this by
+        0.2 %, which the scalings along x and y would otherwise take up with opposite signs.
+        """
         if self._variants is None:
-            larger = 1 + self._config.sensor_as(ShackHartmannSection).motion_sigma
-            grid = replace(self._grid, motion_px=self._grid.motion_px * larger)
-            wavefronts = [larger * one for one in self._wavefronts_m]
-            varied = ShackHartmannModel(self._config, grid, wavefronts, self._overlap)
-            self._variants = [varied] if grid.motion_px or wavefronts else []
+            sensor = self._config.sensor_as(ShackHartmannSection)
+            self._variants = []
+            if self._grid.motion_px or self._wavefronts_m:
+                larger = 1 + sensor.motion_sigma
+                grid = replace(self._grid, motion_px=self._grid.motion_px * larger)
+                wavefronts = [larger * one for one in self._wavefronts_m]
+                self._variants.append(ShackHartmannModel(self._config, grid, wavefronts, self._overlap))
+            anisotropic = copy.copy(self)
+            anisotropic._anisotropy = sensor.anisotropy_sigma  # noqa: SLF001
+            self._variants.append(anisotropic)
         return list(self._variants)
 
     def around_pokes(
