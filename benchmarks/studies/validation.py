@@ -24,7 +24,7 @@ from escape_hw.api.registration import PARAMETERS
 from escape_hw.report.figures.style import SERIES, new_figure, style_axes
 
 #: No constant and no method was chosen on these.
-REALISATIONS = range(3000, 3020)
+REALISATIONS = range(4000, 4020)
 #: The mirror of the bundled benches until version 0.2.0.
 _GAUSSIAN = (
     "devices.dm.influence=gaussian", "devices.dm.coupling=0.4", "twin.mirror.shape=gaussian",
