@@ -23,8 +23,8 @@ from registration_errors import contamination_overrides, print_table, run_realis
 from escape_hw.api.registration import PARAMETERS
 from escape_hw.report.figures.style import SERIES, new_figure, style_axes
 
-#: No constant and no method was chosen on these.
-REALISATIONS = range(4000, 4020)
+#: Realisations of a case. No constant and no method was chosen on them.
+N_REALISATIONS = 20
 #: The mirror of the bundled benches until version 0.2.0.
 _GAUSSIAN = (
     "devices.dm.influence=gaussian", "devices.dm.coupling=0.4", "twin.mirror.shape=gaussian",
@@ -38,13 +38,19 @@ _THIN_PLATE = (
 
 @dataclass(frozen=True)
 class Case:
-    """A system with a mirror and a number of frames; ``title`` is its heading."""
+    """A system with a mirror and a number of frames; ``title`` is its heading, ``first`` its first realisation."""
 
     title: str
     system: str
     frames: int
     overrides: tuple[str, ...] = ()
     dm97: bool = False
+    first: int = 4000
+
+    @property
+    def realisations(self) -> range:
+        """Numbers of the realisations."""
+        return range(self.first, self.first + N_REALISATIONS)
 
 
 CASES = {
@@ -52,17 +58,17 @@ CASES = {
     "dm97-50": Case("mirrors like a DM97, 50 frames", "razor-shwfs", 50, dm97=True),
     "gaussian-50": Case("Gaussian influence functions, 50 frames", "razor-shwfs", 50, _GAUSSIAN),
     "thin-plate-1000": Case("thin plates, 1,000 frames", "razor-shwfs", 1000, _THIN_PLATE),
-    "dm97-1500": Case("mirrors like a DM97, 1,500 frames", "razor-pywfs", 1500, dm97=True),
+    "dm97-1500": Case("mirrors like a DM97, 1,500 frames", "razor-pywfs", 1500, dm97=True, first=3000),
     "revolt-2000": Case("as bundled, 2,000 frames", "revolt-shwfs", 2000),
-    "nir-1500": Case("as bundled, 1,500 frames", "maps-nir", 1500),
+    "nir-1500": Case("as bundled, 1,500 frames", "maps-nir", 1500, first=3000),
     "nir-clean-1500": Case(
-        "clean and evenly lit, 1,500 frames", "maps-nir", 1500, tuple(contamination_overrides(0.0))
+        "clean and evenly lit, 1,500 frames", "maps-nir", 1500, tuple(contamination_overrides(0.0)), first=3000
     ),
     "nir-tenth-1500": Case(
         "a tenth of the pupil contaminated, 1,500 frames", "maps-nir", 1500,
-        tuple(contamination_overrides(0.28)),
+        tuple(contamination_overrides(0.28)), first=3000,
     ),
-    "vis-1500": Case("as bundled, 1,500 frames", "maps-vis", 1500),
+    "vis-1500": Case("as bundled, 1,500 frames", "maps-vis", 1500, first=3000),
 }  # fmt: skip
 
 #: Limits of the rms errors that the page claims: shift, rotation, scaling; and of what a matrix leaves, in %.
@@ -83,7 +89,7 @@ def measure(folder: Path, name: str) -> None:
     each_realisation(
         table_path(folder, name),
         {"system": case.system, "frames": case.frames, "set": list(case.overrides), "dm97": case.dm97},
-        REALISATIONS,
+        case.realisations,
         lambda number: run_realisation(case.system, number, case.frames, list(case.overrides), case.dm97),
         lambda row: f"{name} {np.round(row['error'], 3).tolist()}",
     )

@@ -542,7 +542,7 @@ class ShackHartmannModel(DesignModel):
         half = self._grid.n_valid
         change = (parts[3] - parts[4]).astype(float)
         change[half:] *= -1
-        return change * (self._anisotropy * self._opd_per_command_m)
+        return np.asarray(change * (self._anisotropy * self._opd_per_command_m))
 
     def _isotropic_matrix(self, registration: Registration, width: float) -> NDArray[np.float64]:
         if not self._is_separable(registration):
@@ -642,8 +642,8 @@ class ShackHartmannModel(DesignModel):
         """Models of a sensor that differs, see :class:`SyntheticModel`.
 
         One has motion and pokes larger by the motion's uncertainty. To the other, x slopes see influence
-        functions wider along x and narrower along y, and y slopes the other way round. Turbulence does this by
-        0.2 %, which the scalings along x and y would otherwise take up with opposite signs.
+        functions wider along x and narrower along y, and y slopes the other way round. Turbulence does this
+        by 0.2 %, which the scalings along x and y would otherwise take up with opposite signs.
         """
         if self._variants is None:
             sensor = self._config.sensor_as(ShackHartmannSection)
