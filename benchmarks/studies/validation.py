@@ -38,7 +38,10 @@ _THIN_PLATE = (
 
 @dataclass(frozen=True)
 class Case:
-    """A system with a mirror and a number of frames; ``title`` is its heading, ``first`` its first realisation."""
+    """A system with a mirror and a number of frames.
+
+    ``title`` is its heading, and ``first`` its first realisation.
+    """
 
     title: str
     system: str
@@ -62,7 +65,8 @@ CASES = {
     "revolt-2000": Case("as bundled, 2,000 frames", "revolt-shwfs", 2000),
     "nir-1500": Case("as bundled, 1,500 frames", "maps-nir", 1500, first=3000),
     "nir-clean-1500": Case(
-        "clean and evenly lit, 1,500 frames", "maps-nir", 1500, tuple(contamination_overrides(0.0)), first=3000
+        "clean and evenly lit, 1,500 frames", "maps-nir", 1500,
+        tuple(contamination_overrides(0.0)), first=3000,
     ),
     "nir-tenth-1500": Case(
         "a tenth of the pupil contaminated, 1,500 frames", "maps-nir", 1500,
