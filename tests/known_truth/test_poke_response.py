@@ -44,7 +44,7 @@ def test_parts_of_an_exposure(overlap):
     assert sum(share for share, _, _ in parts) == pytest.approx(1.0)
     mean = sum(share * wavefront for share, _, wavefront in parts)
     np.testing.assert_allclose(mean, [overlap, 1 - overlap])
-    # A response that does not depend on the wavefront is found as it is.
+    # If the response does not depend on the wavefront, the weights must not change it.
     assert sum(weight for _, weight, _ in parts) == pytest.approx(1.0)
 
 
