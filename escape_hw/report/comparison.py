@@ -14,7 +14,7 @@ from escape_hw.api.registration import PARAMETERS, UNITS
 from escape_hw.api.results import CalibrationResult, Estimate, RegistrationEstimate
 from escape_hw.errors import IncompatibleProduct
 from escape_hw.report.figures.matrix import representative_modes
-from escape_hw.report.tables import TITLES, Table, format_with_error
+from escape_hw.report.tables import TITLES, Table, format_error, format_with_error
 
 #: Standard deviation of normal values relative to their median absolute deviation.
 _NORMAL_MAD = 1.4826
@@ -190,7 +190,7 @@ def registration_table(result: MatrixComparison) -> Table:
         between = result.between_runs.get(name)
         if between is not None:
             significance = f"{between.value / between.sigma:+.1f}" if between.sigma > 0 else "–"
-            row += [f"{between.sigma:.2g}", significance.replace("-", "−")]
+            row += [format_error(between.sigma), significance.replace("-", "−")]
         rows.append(tuple(row))
     headings = ("± between runs", "change / σ") if result.between_runs else ()
     return Table(("Component", "α(B) − α(A)", *headings), tuple(rows))

@@ -67,7 +67,15 @@ def format_with_error(value: Estimate) -> str:
         return f"{value.value:.4g}".replace("-", "−")
     digits = max(0, 1 - math.floor(math.log10(value.sigma)))
     # Adding 0.0 turns a rounded −0.0 into 0.0.
-    return f"{round(value.value, digits) + 0.0:.{digits}f} ± {value.sigma:.{digits}f}".replace("-", "−")
+    number = f"{round(value.value, digits) + 0.0:.{digits}f}".replace("-", "−")
+    return f"{number} ± {format_error(value.sigma)}"
+
+
+def format_error(sigma: float) -> str:
+    """A standard error with two significant digits, also if the second is a nought."""
+    if not math.isfinite(sigma) or not 0 < sigma < 1e6:
+        return f"{sigma:.2g}"
+    return f"{sigma:.{max(0, 1 - math.floor(math.log10(sigma)))}f}"
 
 
 def format_percent(value: Estimate) -> str:
@@ -127,7 +135,7 @@ def parameters_table(
             value = estimate.get(name)
             row.append("–" if value is None else format_with_error(value))
             if label in between:
-                row.append(f"{between[label][name]:.2g}" if name in between[label] else "–")
+                row.append(format_error(between[label][name]) if name in between[label] else "–")
             if injected is not None:
                 row.append("–" if value is None or name not in truth else _format_pull(value, truth[name]))
         if injected is not None:

@@ -21,7 +21,7 @@ def differences(quoted: str, printed: str) -> list[str]:
     """Lines of a quotation that the output does not have, or has with other numbers.
 
     A value with an error may be half of that error off, a difference over its error a half, other numbers
-    two per cent: what another processor's rounding may do, and no other estimator.
+    two per cent or one of their last digit: what another processor's rounding may do, and no other estimator.
     """
     found: dict[str, list[str]] = {}
     for line in printed.splitlines():
@@ -48,4 +48,9 @@ def _same_measured(quoted: tuple[str, str], printed: tuple[str, str]) -> bool:
 def _near(quoted: str, printed: str) -> bool:
     a, b = _value(quoted), _value(printed)
     # What carries a sign is a difference in units of its error.
-    return abs(a - b) <= (0.5 if printed[0] in "+−" else 0.02 * abs(b))
+    if printed[0] in "+−":
+        return abs(a - b) <= 0.5
+    # A whole number is a count, which rounding does not change.
+    places = max(len(text.partition(".")[2]) for text in (quoted, printed))
+    last_digit = 10.0**-places if places else 0.0
+    return abs(a - b) <= max(0.02 * abs(b), 1.001 * last_digit)
