@@ -6,22 +6,17 @@ import json
 import re
 import shlex
 import sys
-from pathlib import Path
 
 import pytest
+from pages import ROOT
 
-ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "studies" / "nuisances.md").read_text()
-COMMANDS = re.findall(r"^python (benchmarks/studies/nuisances\.py .*)$", PAGE, re.MULTILINE)
+COMMANDS = re.findall(r"^python (benchmarks/studies/registration/nuisances\.py .*)$", PAGE, re.MULTILINE)
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_the_page_has_what_the_command_prints(command, capsys, monkeypatch):
-    monkeypatch.syspath_prepend(ROOT / "benchmarks" / "studies")
-    for name in ("nuisances", "registration_errors", "realisation_tables"):
-        monkeypatch.delitem(sys.modules, name, raising=False)
-    import nuisances
-
+def test_the_page_has_what_the_command_prints(command, capsys, monkeypatch, import_study):
+    nuisances = import_study("registration/nuisances.py")
     monkeypatch.setattr(nuisances, "run_realisation", None)
     monkeypatch.chdir(ROOT)
     monkeypatch.setattr(sys, "argv", shlex.split(command))

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
+from pages import ROOT
 
-ROOT = Path(__file__).parents[2]
 FOLDER = ROOT / "docs" / "studies" / "validation"
 SYSTEMS = {"razor-shwfs", "razor-pywfs", "revolt-shwfs", "maps-nir", "maps-vis"}
 #: Tables of earlier commits, whose statistics the page quotes.
@@ -18,13 +15,8 @@ MAX_PULL = 4.0
 
 
 @pytest.fixture
-def validation(monkeypatch):
-    monkeypatch.syspath_prepend(ROOT / "benchmarks" / "studies")
-    for name in ("registration_errors", "realisation_tables", "matrix_agreement", "validation"):
-        monkeypatch.delitem(sys.modules, name, raising=False)
-    import validation
-
-    return validation
+def validation(import_study):
+    return import_study("registration/validation.py")
 
 
 def test_the_page_is_that_of_the_raw_tables(validation):

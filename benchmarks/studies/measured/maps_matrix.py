@@ -1,6 +1,7 @@
 """The published zonal matrix of MAPS' visible arm beside the twin's DO-CRIME matrix and the synthetic one.
 
-    python benchmarks/studies/maps_matrix.py --data ../shared/data/maps --out docs/studies/maps-matrix
+    python benchmarks/studies/measured/maps_matrix.py --data ../shared/data/maps \\
+        --out docs/studies/maps-matrix
 
 Fits the registration of the published matrix with the registration-only solver, measures DO-CRIME on the twin
 of ``maps-vis`` at that registration, and compares both with each other and with the synthetic matrix in the
@@ -20,11 +21,11 @@ from typing import Any
 import numpy as np
 from astropy.io import fits
 from maps_matrix_figure import draw
-from matrix_agreement import correlation
 from numpy.typing import NDArray
 from PIL import Image
-from realisation_tables import study_parser
 
+from escape_benchmarks.matrix_agreement import correlation
+from escape_benchmarks.realisation_tables import study_parser
 from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.pyramid import PyramidPupils
 from escape_hw.api.registration import PARAMETERS, Registration

@@ -1,7 +1,7 @@
 """Error of the registration by the size of the pokes, on a Shack-Hartmann twin without noise and turbulence.
 
-    python benchmarks/studies/lenslet_pokes.py --out docs/studies/lenslet-pokes
-    python benchmarks/studies/lenslet_pokes.py --out docs/studies/lenslet-pokes --settling 0.17
+    python benchmarks/studies/registration/lenslet_pokes.py --out docs/studies/lenslet-pokes
+    python benchmarks/studies/registration/lenslet_pokes.py --out docs/studies/lenslet-pokes --settling 0.17
 
 The mirror equals the nominal one, and slopes are computed from images without noise, so that only the
 response of the spots to the pokes differs from the synthetic model. Random pokes of all modes, a fraction of
@@ -19,8 +19,8 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from realisation_tables import Line, each_realisation, realisation_numbers, study_parser
 
+from escape_benchmarks.realisation_tables import Line, each_realisation, realisation_numbers, study_parser
 from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.sensor import SubApertureGrid
 from escape_hw.calibration.acquisition.frames import build_interaction_matrix

@@ -1,7 +1,8 @@
 """Error of the registration against the number of frames: runs the campaign and draws its curves.
 
-    python benchmarks/studies/sky_time.py --realisations 20 --frames 20 50 220 1000 --out docs/figures
-    python benchmarks/studies/sky_time.py --realisations 5 --frames 1000 8000 --estimators unwhitened
+    python benchmarks/studies/sky_time/sky_time.py --realisations 20 --frames 20 50 220 1000 \\
+        --out docs/figures
+    python benchmarks/studies/sky_time/sky_time.py --realisations 5 --frames 1000 8000 --estimators unwhitened
 
 Writes ``sky-time.jsonl`` (appends one line per realisation; realisations already in the file are skipped),
 ``sky-time.json`` and ``sky-time.png``, with the name of the system appended for any but ``razor-shwfs``.
@@ -17,7 +18,8 @@ import argparse
 import json
 
 import numpy as np
-from realisation_tables import (
+
+from escape_benchmarks.realisation_tables import (
     Line,
     array,
     each_realisation,
@@ -26,7 +28,6 @@ from realisation_tables import (
     study_parser,
     to_json,
 )
-
 from escape_hw.paper.sky_time import (
     ESTIMATORS,
     FRAMES,

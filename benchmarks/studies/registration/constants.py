@@ -1,7 +1,7 @@
 """Effect of every constant that enters a prior or a stated error of SPRINT, halved and doubled.
 
-    python benchmarks/studies/constants.py --system razor-shwfs --frames 1000 --first 1000 --out docs/studies/constants
-    python benchmarks/studies/constants.py --system razor-pywfs --frames 1500 --first 1000 --out docs/studies/constants
+    python benchmarks/studies/registration/constants.py --system razor-shwfs --frames 1000 --first 1000 --out docs/studies/constants
+    python benchmarks/studies/registration/constants.py --system razor-pywfs --frames 1500 --first 1000 --out docs/studies/constants
 
 Each realisation, as in ``registration_errors.py``, is measured once with DO-CRIME. Its matrix is then fitted
 with the constants as they are, and again with one of them halved or doubled. Writes
@@ -18,8 +18,8 @@ from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
-from realisation_tables import Line, each_realisation, realisation_numbers, study_parser
 
+from escape_benchmarks.realisation_tables import Line, each_realisation, realisation_numbers, study_parser
 from escape_hw.api.results import RegistrationEstimate
 from escape_hw.calibration.docrime.open_loop import docrime_run
 from escape_hw.calibration.sprint.fit import sprint, sprint_options_from_config

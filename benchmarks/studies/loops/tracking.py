@@ -1,9 +1,9 @@
 """Tracker on a drifting bench, compared with a loop that uses the true registration and one never updated.
 
-    python benchmarks/studies/tracking.py track --seconds 600 --out tracked
-    python benchmarks/studies/tracking.py compare --loop true --out tracked
-    python benchmarks/studies/tracking.py compare --loop first --out tracked
-    python benchmarks/studies/tracking.py draw --out tracked --figure docs/figures/tracking.png
+    python benchmarks/studies/loops/tracking.py track --seconds 600 --out tracked
+    python benchmarks/studies/loops/tracking.py compare --loop true --out tracked
+    python benchmarks/studies/loops/tracking.py compare --loop first --out tracked
+    python benchmarks/studies/loops/tracking.py draw --out tracked --figure docs/figures/tracking.png
 
 ``track`` calibrates, finds the optical gains on a pyramid, and runs the tracker once over all frames. It
 writes its table with the twin's true values (``track.json``; ``live.jsonl`` while it runs). ``compare``
@@ -26,8 +26,8 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
-from realisation_tables import append_line, read_lines, study_parser
 
+from escape_benchmarks.realisation_tables import append_line, read_lines, study_parser
 from escape_hw.api.procedure import Progress
 from escape_hw.api.registration import PARAMETERS, Registration
 from escape_hw.api.results import CalibrationResult

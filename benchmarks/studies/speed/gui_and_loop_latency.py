@@ -4,7 +4,7 @@ A server of ``razor-shwfs`` on the twin, which loses no frames here, closes its 
 A window connected to it is halted and resumed every few seconds, so that other load of the machine affects
 both equally. Prints the ratios of the medians over all turns, and the 16th and 84th percentile of a bootstrap
 over pairs of turns: where 1 lies between them, the effect of the window is within the noise.
-``python benchmarks/studies/gui_and_loop_latency.py [TURNS]``.
+``python benchmarks/studies/speed/gui_and_loop_latency.py [TURNS]``.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests"))
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests" / "process"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[3] / "tests"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[3] / "tests" / "process"))
 
 from serving import SYSTEM, Served, serving, until_idle, wait_for
 

@@ -1,7 +1,8 @@
 """Validation of the registration on all systems: raw tables, the page of their statistics, and its figure.
 
-    python benchmarks/studies/validation.py --out docs/studies/validation
-    python benchmarks/studies/validation.py --out docs/studies/validation --cases dm97-1000 dm97-50
+    python benchmarks/studies/registration/validation.py --out docs/studies/validation
+    python benchmarks/studies/registration/validation.py --out docs/studies/validation \\
+        --cases dm97-1000 dm97-50
 
 Measures the realisations that the raw tables lack (``registration_errors.py`` has their contents), for all
 cases or some of them, and then writes ``tables.md`` and ``errors.png`` from all tables that are there. May be
@@ -17,9 +18,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from realisation_tables import Line, each_realisation, read_lines, study_parser
 from registration_errors import contamination_overrides, print_table, run_realisation
 
+from escape_benchmarks.realisation_tables import Line, each_realisation, read_lines, study_parser
 from escape_hw.api.registration import PARAMETERS
 from escape_hw.report.figures.style import SERIES, new_figure, style_axes
 
@@ -109,7 +110,7 @@ def page(tables: dict[str, list[Line]]) -> str:
     """The page of the statistics."""
     lines = [
         "# Tables of the validation", "",
-        "Written by `benchmarks/studies/validation.py` from the raw tables in this folder "
+        "Written by `benchmarks/studies/registration/validation.py` from the raw tables in this folder "
         "([what they show](../validation.md)). Columns: shift x and y in % of a sub-aperture, rotation in "
         "degrees, radial and tangential scaling in % of the diameter. Rows: rms error, mean error, and mean "
         "squared error over the squared standard error; *matrix*: mean of what the pseudo-synthetic matrix "

@@ -1,9 +1,9 @@
 """Strehl ratios on equal turbulence of ESCAPE, DO-CRIME and push-pull (the baseline), and registrations.
 
-    python benchmarks/studies/loop_comparison.py --seeds 1 2 3 4 5 6 7 8 9 10 --out paired
-    python benchmarks/studies/loop_comparison.py --system revolt-shwfs --seeds 1 2 3 4 5 --short 1000 \\
+    python benchmarks/studies/loops/loop_comparison.py --seeds 1 2 3 4 5 6 7 8 9 10 --out paired
+    python benchmarks/studies/loops/loop_comparison.py --system revolt-shwfs --seeds 1 2 3 4 5 --short 1000 \\
         --calibration 4000 --set loop.gain=0.7 --out paired --table docs/studies/paired-loops
-    python benchmarks/studies/loop_comparison.py --system maps-nir --no-gains --no-baseline \\
+    python benchmarks/studies/loops/loop_comparison.py --system maps-nir --no-gains --no-baseline \\
         --out paired --table docs/studies/paired-loops
 
 Each seed is a twin with a mirror and turbulence of its own. Every matrix is closed at its own best gain,
@@ -32,8 +32,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from realisation_tables import Line, append_line, each_realisation, read_lines, study_parser
 
+from escape_benchmarks.realisation_tables import Line, append_line, each_realisation, read_lines, study_parser
 from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.registration import PARAMETERS, UNITS
 from escape_hw.api.results import CalibrationResult
@@ -309,7 +309,7 @@ def page(rows: Sequence[Line], title: str, raw: str) -> list[str]:
     return [
         f"# {title}", "",
         f"{len(rows)} seeds, commit {commits}. Raw table: [`{raw}`]({raw}). Made by "
-        "`benchmarks/studies/loop_comparison.py` with", "",
+        "`benchmarks/studies/loops/loop_comparison.py` with", "",
         *(f"- {key}: {value}" for key, value in asked.items()), "",
         "## Strehl ratio in %, each matrix at its own best gain (with a margin), on equal turbulence", "",
         *strehl_lines(rows), "", "## Registration: rms error (normalised chi-squared)", "",

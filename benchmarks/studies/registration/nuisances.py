@@ -1,7 +1,8 @@
 """What each imperfection of a sensor changes in the registration of a calibration: paired realisations.
 
-    python benchmarks/studies/nuisances.py --system razor-shwfs --frames 1000 --realisations 5
-    python benchmarks/studies/nuisances.py --system razor-pywfs --frames 1500 --realisations 3 --case diameter
+    python benchmarks/studies/registration/nuisances.py --system razor-shwfs --frames 1000 --realisations 5
+    python benchmarks/studies/registration/nuisances.py --system razor-pywfs --frames 1500 --realisations 3 \\
+        --case diameter
 
 Each imperfection of :data:`CASES` is drawn from the distribution stated there, with the number of the
 realisation as seed, and the realisation is calibrated with it and without any of them: the same mirror,
@@ -19,9 +20,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from realisation_tables import Line, each_realisation, realisation_numbers, study_parser
 from registration_errors import run_realisation
 
+from escape_benchmarks.realisation_tables import Line, each_realisation, realisation_numbers, study_parser
 from escape_hw.config.loader import load_system
 from escape_hw.config.system import SystemConfig
 

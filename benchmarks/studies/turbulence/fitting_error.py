@@ -1,6 +1,6 @@
 """What a telescope's mirror leaves of the turbulence, by number of modes: the Strehl that no loop exceeds.
 
-    python benchmarks/studies/fitting_error.py --system maps-nir --modes 50 100 200 300
+    python benchmarks/studies/turbulence/fitting_error.py --system maps-nir --modes 50 100 200 300
 
 Random screens of the twin's strength are fitted with the configured basis over the lit pupil, with and
 without the disabled actuators. Prints the residual in nm, within the mirror's innermost ring and outside,
@@ -11,8 +11,8 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from realisation_tables import study_parser
 
+from escape_benchmarks.realisation_tables import study_parser
 from escape_hw.api.registration import Registration
 from escape_hw.calibration.modes.bases import karhunen_loeve
 from escape_hw.config.loader import load_system

@@ -3,7 +3,7 @@
 New entries arrive in every stream before each refresh, faster than from a server; the panels take them at
 their own rates. Prints the median and the 99th percentile of the time of a refresh alone, and with the
 drawing that follows it, in software and without a display.
-``python benchmarks/studies/gui_frame_budget.py [TICKS]``.
+``python benchmarks/studies/speed/gui_frame_budget.py [TICKS]``.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ import time
 from pathlib import Path
 
 os.environ["QT_QPA_PLATFORM"] = "offscreen"
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests"))
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests" / "gui"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[3] / "tests"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[3] / "tests" / "gui"))
 
 import numpy as np
 from gui_windows import dispose, settle, show_window

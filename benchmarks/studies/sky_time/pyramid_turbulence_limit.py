@@ -1,6 +1,6 @@
 """Registration error of a pyramid due to turbulence alone, against the number of frames.
 
-    python benchmarks/studies/pyramid_turbulence_limit.py --system maps-nir --frames 75 300 1500 3000
+    python benchmarks/studies/sky_time/pyramid_turbulence_limit.py --system maps-nir --frames 75 300 1500 3000
 
 All is given except gain, registration and the model's variants: the positions of the images and the strength
 of the turbulence are known, and the model is linearised at the injected registration. Frames are fitted
@@ -19,8 +19,8 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from realisation_tables import study_parser
 
+from escape_benchmarks.realisation_tables import study_parser
 from escape_hw.api.pyramid import PyramidPupils
 from escape_hw.api.registration import PARAMETERS
 from escape_hw.api.sensor import require_kind

@@ -1,7 +1,7 @@
 """Optical gains on a pyramid twin: against the twin's truth, and what they do for the loop.
 
-    python benchmarks/studies/optical_gains.py gains --seeds 1 2 3      bias and errors against the truth
-    python benchmarks/studies/optical_gains.py pokes --seeds 1 2 3   Strehl ratio with and without pokes
+    python benchmarks/studies/loops/optical_gains.py gains --seeds 1 2 3   bias and errors against the truth
+    python benchmarks/studies/loops/optical_gains.py pokes --seeds 1 2 3   Strehl ratio with and without pokes
 
 One JSON document per seed and line. The truth is push-pull around wavefronts frozen while the loop ran.
 """
@@ -15,8 +15,8 @@ from contextlib import closing
 from typing import Any
 
 import numpy as np
-from realisation_tables import study_parser
 
+from escape_benchmarks.realisation_tables import study_parser
 from escape_hw.api.pyramid import PyramidPupils
 from escape_hw.api.results import CalibrationResult
 from escape_hw.calibration.acquisition.pokes import (

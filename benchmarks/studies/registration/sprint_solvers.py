@@ -1,6 +1,6 @@
 """SPRINT's variants beside the default: error and time on the same matrices, measured on the twin.
 
-    python benchmarks/studies/sprint_solvers.py --realisations 8 --frames 1000
+    python benchmarks/studies/registration/sprint_solvers.py --realisations 8 --frames 1000
 
 Prints a table: rms error over random realisations with all imperfections on, normalised chi-squared, and time
 in units of the default's, every variant on every matrix in the same run.
@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from realisation_tables import study_parser
 
+from escape_benchmarks.realisation_tables import study_parser
 from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.synthetic_model import SyntheticModel
 from escape_hw.calibration.docrime.open_loop import docrime_run

@@ -1,6 +1,7 @@
 """Measured influence functions of IRTF's adaptive secondary against its measured matrices.
 
-    python benchmarks/studies/irtf_matrix.py --data ../shared/data/irtf --out docs/studies/irtf-matrix
+    python benchmarks/studies/measured/irtf_matrix.py --data ../shared/data/irtf \\
+        --out docs/studies/irtf-matrix
 
 The synthetic matrix is the mean slope of the measured surfaces over each of 12 x 12 sub-apertures. SPRINT
 fits its registration to the matrices of two days, in all eight orientations of the camera, and then gains and
@@ -16,11 +17,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matrix_agreement import correlation, remaining
 from numpy.typing import NDArray
-from realisation_tables import study_parser
 from scipy import ndimage
 
+from escape_benchmarks.matrix_agreement import correlation, remaining
+from escape_benchmarks.realisation_tables import study_parser
 from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.procedure import run
 from escape_hw.api.registration import Registration

@@ -1,7 +1,7 @@
 """Capture range of SPRINT: random registrations up to two actuator pitches and ten degrees away.
 
-    python benchmarks/studies/capture_range.py --system razor-shwfs --out docs/studies/capture
-    python benchmarks/studies/capture_range.py --system razor-pywfs --out docs/studies/capture
+    python benchmarks/studies/registration/capture_range.py --system razor-shwfs --out docs/studies/capture
+    python benchmarks/studies/registration/capture_range.py --system razor-pywfs --out docs/studies/capture
 
 Each realisation is a twin with all its imperfections, measured by push-pull without turbulence, two frames
 per sign. SPRINT gets that matrix and a model built on the located images, and starts from zero. A realisation
@@ -16,8 +16,8 @@ from __future__ import annotations
 import sys
 
 import numpy as np
-from realisation_tables import Line, each_realisation, realisation_numbers, study_parser
 
+from escape_benchmarks.realisation_tables import Line, each_realisation, realisation_numbers, study_parser
 from escape_hw.api.registration import Registration
 from escape_hw.calibration.sprint.fit import sprint
 from escape_hw.io.provenance import get_git_state

@@ -1,6 +1,6 @@
 """Strehl ratio and registration against the magnitude of the star, with ESCAPE's matrix and DO-CRIME's.
 
-    python benchmarks/studies/star_magnitudes.py --system maps-nir --scan 450 --loop 900 \\
+    python benchmarks/studies/loops/star_magnitudes.py --system maps-nir --scan 450 --loop 900 \\
         --table docs/studies/star-magnitudes --out magnitudes
 
 Both matrices come from the same frames. Each seed is a twin with a mirror and turbulence of its own, the
@@ -27,8 +27,8 @@ from loop_comparison import (
     measure_seed,
 )
 from matplotlib.axes import Axes
-from realisation_tables import Line, each_realisation
 
+from escape_benchmarks.realisation_tables import Line, each_realisation
 from escape_hw.errors import CalibrationError
 from escape_hw.pipeline.statistics import mean_interval
 from escape_hw.report.figures.style import SERIES, legend, new_figure, style_axes

@@ -1,6 +1,6 @@
 """Structure function and boiling of the twin's open-air turbulence against theory, as a figure.
 
-    python benchmarks/studies/atmosphere.py --out docs/figures
+    python benchmarks/studies/turbulence/atmosphere.py --out docs/figures
 
 Writes ``atmosphere.png``. Takes about a minute.
 """
@@ -12,9 +12,9 @@ import math
 import numpy as np
 from matplotlib.axes import Axes
 from numpy.typing import NDArray
-from realisation_tables import study_parser
 from scipy import special
 
+from escape_benchmarks.realisation_tables import study_parser
 from escape_hw.report.figures import style
 from escape_sim.atmosphere.layers import TurbulentLayer
 from escape_sim.atmosphere.von_karman import TurbulenceSource

@@ -1,7 +1,8 @@
 """Error of the mean place of a pyramid's pupil images, on which the shift of a registration depends.
 
-    python benchmarks/studies/pupil_image_errors.py --system maps-nir --first 20
-    python benchmarks/studies/pupil_image_errors.py --system maps-nir --first 20 --contaminated 0.28
+    python benchmarks/studies/registration/pupil_image_errors.py --system maps-nir --first 20
+    python benchmarks/studies/registration/pupil_image_errors.py --system maps-nir --first 20 \\
+        --contaminated 0.28
 
 The images are located on the frames of a DO-CRIME run, as `escape calibrate` does, without the registration:
 a realisation takes some seconds. Realisations and ``--contaminated`` are those of registration_errors.py.
@@ -13,9 +14,9 @@ chi-squared.
 from __future__ import annotations
 
 import numpy as np
-from realisation_tables import Line, each_realisation, realisation_numbers, study_parser
 from registration_errors import contamination_overrides
 
+from escape_benchmarks.realisation_tables import Line, each_realisation, realisation_numbers, study_parser
 from escape_hw.api.pyramid import PyramidPupils
 from escape_hw.api.sensor import require_kind
 from escape_hw.calibration.docrime.open_loop import docrime_run

@@ -1,7 +1,7 @@
 """Registration and influence functions of a real ALPAO DM97 from its matrices of 25 dates.
 
-    python benchmarks/studies/measured_mirrors.py --data ../shared/data/dm97 --out
-    docs/studies/measured-mirrors
+    python benchmarks/studies/measured/measured_mirrors.py --data ../shared/data/dm97 \\
+        --out docs/studies/measured-mirrors
 
 Writes ``dm97.jsonl``, one line per date: registration, its errors and those between runs, residual, shape,
 gains of the actuators; and for successive dates the change of the registration, and what the synthetic matrix
@@ -17,11 +17,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matrix_agreement import remaining
 from numpy.typing import NDArray
-from realisation_tables import append_line, read_lines, study_parser
 
+from escape_benchmarks.matrix_agreement import remaining
 from escape_benchmarks.measured.dm97 import fit_matrix, make_model, read_entries, read_matrix
+from escape_benchmarks.realisation_tables import append_line, read_lines, study_parser
 from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.registration import PARAMETERS
 from escape_hw.api.synthetic_model import PROFILE_WIDTHS

@@ -1,6 +1,6 @@
 """How the cost of a frame grows: ours and OOPAO's against sub-apertures, actuators and modulation.
 
-    python benchmarks/studies/scaling.py --out scaling --minutes 20 --figure docs/figures/scaling.png \
+    python benchmarks/studies/speed/scaling.py --out scaling --minutes 20 --figure docs/figures/scaling.png \\
         --page docs/performance.md
 
 Every point runs in a process of its own, so that its peak memory is its own. Points already in
@@ -21,8 +21,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
-from realisation_tables import study_parser
 
+from escape_benchmarks.realisation_tables import study_parser
 from escape_hw.config.bundled import bundled_systems
 from escape_hw.config.loader import load_system
 

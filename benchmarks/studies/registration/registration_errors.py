@@ -1,8 +1,10 @@
 """Error of the registration of a calibration, as `escape calibrate` makes it, over random realisations.
 
-    python benchmarks/studies/registration_errors.py --system razor-pywfs --frames 1000 --realisations 20
-    python benchmarks/studies/registration_errors.py --system maps-nir --frames 1500 --contaminated 0.28
-    python benchmarks/studies/registration_errors.py --system razor-shwfs --dm97 --first 1000
+    python benchmarks/studies/registration/registration_errors.py --system razor-pywfs --frames 1000 \\
+        --realisations 20
+    python benchmarks/studies/registration/registration_errors.py --system maps-nir --frames 1500 \\
+        --contaminated 0.28
+    python benchmarks/studies/registration/registration_errors.py --system razor-shwfs --dm97 --first 1000
 
 Each realisation is a twin with all its imperfections, shifted by up to a sub-aperture, turned by up to two
 degrees and scaled by up to 4 %. On a telescope ``--contaminated`` is the share of the circumference that dirt
@@ -19,9 +21,9 @@ the rms error of the images' mean place in pixels. A realisation takes about hal
 from __future__ import annotations
 
 import numpy as np
-from matrix_agreement import remaining
-from realisation_tables import Line, each_realisation, realisation_numbers, study_parser
 
+from escape_benchmarks.matrix_agreement import remaining
+from escape_benchmarks.realisation_tables import Line, each_realisation, realisation_numbers, study_parser
 from escape_hw.api.pyramid import PyramidPupils
 from escape_hw.api.results import CalibrationResult
 from escape_hw.config.sensor import PyramidSection

@@ -1,7 +1,7 @@
 """What SPRINT says of wrongly described matrices: a real DM97 bench, and a small Shack-Hartmann twin.
 
-    python benchmarks/studies/wrong_descriptions.py --data ../shared/data/dm97 --out
-    docs/studies/measured-mirrors
+    python benchmarks/studies/measured/wrong_descriptions.py --data ../shared/data/dm97 \\
+        --out docs/studies/measured-mirrors
 
 Each row is one wrong description or one fault that the description does not mention. Writes
 ``wrong-descriptions.jsonl``: whether the fit converged, the registration relative to that of the correct
@@ -18,9 +18,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from realisation_tables import append_line, read_lines, study_parser
 
 from escape_benchmarks.measured import dm97
+from escape_benchmarks.realisation_tables import append_line, read_lines, study_parser
 from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.procedure import run
 from escape_hw.api.registration import PARAMETERS

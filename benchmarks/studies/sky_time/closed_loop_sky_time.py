@@ -1,6 +1,6 @@
 """Error of the registration from small pokes in a running loop, over random realisations.
 
-    python benchmarks/studies/closed_loop_sky_time.py --realisations 10 --frames 1000 --out closed
+    python benchmarks/studies/sky_time/closed_loop_sky_time.py --realisations 10 --frames 1000 --out closed
 
 Each realisation is calibrated in open loop first (1,200 frames at the usual poke); its pseudo-synthetic
 matrix closes the loop, and the registration is estimated again from pokes of the given size in closed loop.
@@ -14,7 +14,8 @@ from __future__ import annotations
 import argparse
 
 import numpy as np
-from realisation_tables import (
+
+from escape_benchmarks.realisation_tables import (
     Line,
     array,
     each_realisation,
@@ -23,7 +24,6 @@ from realisation_tables import (
     study_parser,
     to_json,
 )
-
 from escape_hw.errors import CalibrationError
 from escape_hw.paper.sky_time import GOAL, realisation_config
 from escape_hw.runtime.session.system import System

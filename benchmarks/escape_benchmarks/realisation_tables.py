@@ -88,7 +88,7 @@ def each_realisation(
 
 def to_json(values: NDArray[np.float64]) -> Any:
     """An array as nested lists, what is not finite as None."""
-    return np.where(np.isfinite(values), values.astype(object), None).tolist()
+    return np.where(np.isfinite(values), values.astype(object), np.array(None)).tolist()
 
 
 def array(values: Any) -> NDArray[np.float64]:
