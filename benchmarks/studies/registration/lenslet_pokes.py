@@ -1,16 +1,24 @@
-"""Error of the registration by the size of the pokes, on a Shack-Hartmann twin without noise and turbulence.
+"""Error of the registration by the response of the spots that the model assumes, on a Shack-Hartmann twin.
 
     python benchmarks/studies/registration/lenslet_pokes.py --out docs/studies/lenslet-pokes
     python benchmarks/studies/registration/lenslet_pokes.py --out docs/studies/lenslet-pokes --settling 0.17
+    python benchmarks/studies/registration/lenslet_pokes.py --out docs/studies/lenslet-pokes --frames 1500
 
-The mirror equals the nominal one, and slopes are computed from images without noise, so that only the
-response of the spots to the pokes differs from the synthetic model. Random pokes of all modes, a fraction of
-those of the configuration, are regressed as DO-CRIME does, and SPRINT fits the result: with weights averaged
-over uniform tilts of each lenslet alone, and with weights averaged over the wavefronts of random pokes of the
-same rms as well. With ``--settling`` the mirror goes from each poke to the next during the exposure,
-exponentially with this time constant in exposures; SPRINT then fits also with the delay that DO-CRIME would
-find, from which it knows the share of the poke before. Writes ``SYSTEM.jsonl`` (``SYSTEM-settling.jsonl``)
-with a line per realisation of the pokes and fraction.
+Without ``--frames`` there is neither noise nor turbulence: the mirror equals the nominal one, and slopes are
+computed from images without noise, so that only the response of the spots to the pokes differs from the
+synthetic model. Random pokes of all modes, a fraction of those of the configuration, are regressed as
+DO-CRIME does, and SPRINT fits the result: with weights averaged over uniform tilts of each lenslet alone, and
+with weights averaged over the wavefronts of random pokes of the same rms as well. With ``--settling`` the
+mirror goes from each poke to the next during the exposure, exponentially with this time constant in
+exposures; SPRINT then fits also with the delay that DO-CRIME would find, from which it knows the share of the
+poke before. Writes ``SYSTEM.jsonl`` (``SYSTEM-settling.jsonl``) with a line per realisation of the pokes, and
+prints the mean error of both shifts.
+
+With ``--frames`` the whole twin, whose seed is the number of the realisation, is measured with DO-CRIME at
+shifts of plus and minus a quarter of a sub-aperture, without rotation and scalings. SPRINT fits both matrices
+around pokes, with a mirror at rest during the exposure and with one that settles. Writes
+``SYSTEM-NAME.jsonl``, and prints half the difference of the errors: the part that changes its sign with the
+shift. A realisation takes about two minutes of a core.
 """
 
 from __future__ import annotations
@@ -22,14 +30,19 @@ from numpy.typing import NDArray
 
 from escape_benchmarks.realisation_tables import Line, each_realisation, realisation_numbers, study_parser
 from escape_hw.api.interaction_matrix import InteractionMatrix
+from escape_hw.api.registration import Registration
+from escape_hw.api.results import RegistrationEstimate
 from escape_hw.api.sensor import SubApertureGrid
 from escape_hw.calibration.acquisition.frames import build_interaction_matrix
 from escape_hw.calibration.acquisition.pokes import compute_random_amplitudes
 from escape_hw.calibration.acquisition.sensor_setup import build_sensor_setup, build_slope_function
+from escape_hw.calibration.docrime.open_loop import docrime_run
 from escape_hw.calibration.modes.bases import build_modal_basis
-from escape_hw.calibration.sprint.fit import sprint
+from escape_hw.calibration.sprint.fit import sprint, sprint_options_from_config
+from escape_hw.calibration.sprint.telemetry_fit import decorrelate_columns
 from escape_hw.config.loader import load_system
 from escape_hw.io.provenance import get_git_state
+from escape_hw.paper.sky_time import registration_overrides, simulated_config
 from escape_hw.runtime.session.system import System, open_system
 from escape_sim.devices.true_optical_gains import get_simulated_bench
 from escape_sim.models.shack_hartmann import ShackHartmannModel
@@ -38,6 +51,8 @@ from escape_sim.models.shack_hartmann import ShackHartmannModel
 FRACTIONS = (0.25, 0.5, 1.0)
 #: Fits: weights around tilts, around pokes, and around pokes of a mirror that settles.
 LABELS = ("nominal", "pokes", "settling")
+#: Shift along x and y with ``--frames``, in % of a sub-aperture, and its names in a line.
+SHIFT, SIDES = 25.0, ("plus", "minus")
 #: Times during an exposure at which the image of a mirror that settles is computed.
 N_TIMES = 8
 #: Counts of the brightest pixel on a flat wavefront.
@@ -135,12 +150,49 @@ def run_realisation(
                 fits["settling"] = (measured.matrix_with_delay(), measured.model_with_pokes())
             for label, (matrix, model) in fits.items():
                 found = sprint(matrix, model, start=injected, coarse_search=False)
-                row[label] = {
-                    "error": (found.registration.to_array() - injected.to_array()).tolist(),
-                    "sigma": found.sigma.tolist(), "gain": found.gain.value,
-                }  # fmt: skip
+                row[label] = numbers(found, injected)
             rows.append(row)
     return {"seed": number, "commit": get_git_state(), "fractions": rows}
+
+
+def numbers(found: RegistrationEstimate, injected: Registration) -> Line:
+    """What is saved of a fit."""
+    return {
+        "error": (found.registration.to_array() - injected.to_array()).tolist(),
+        "sigma": found.sigma.tolist(), "gain": found.gain.value,
+    }  # fmt: skip
+
+
+def run_under_turbulence(system: str, number: int, frames: int, overrides: list[str]) -> Line:
+    """Errors of the registration at two opposite shifts, by side and response."""
+    line: Line = {"seed": number, "commit": get_git_state()}
+    for side, shift in zip(SIDES, (SHIFT, -SHIFT), strict=True):
+        injected = Registration(shift_x=shift, shift_y=shift)
+        config = simulated_config(system, [*overrides, *registration_overrides(injected)], seed=number)
+        with System.from_config(config) as bench:
+            run = bench.run(docrime_run(bench, frames=frames))
+            solution, grid = run.solution, run.result.grid
+            matrix = decorrelate_columns(run.result.matrix, solution.gram, solution.variance)
+            # With a whole number of frames a mirror is at rest during the exposure.
+            at_rest = replace(matrix, metrics={**matrix.metrics, "delay_frames": 1.0})
+            options = sprint_options_from_config(config.calibration)
+            line[side] = {"delay_frames": run.result.matrix.metrics["delay_frames"]}
+            for label, measured in (("pokes", at_rest), ("settling", matrix)):
+                found = sprint(
+                    measured, bench.model(grid), start=injected, coarse_search=False,
+                    covariance=solution.covariance, **options,
+                )  # fmt: skip
+                line[side][label] = numbers(found, injected)
+    return line
+
+
+def print_odd_parts(rows: list[Line]) -> None:
+    """Half the difference of the errors of the shifts in % of a sub-aperture, by response: mean, and each."""
+    for label in LABELS[1:]:
+        plus, minus = (np.array([row[side][label]["error"][:2] for row in rows]) for side in SIDES)
+        odd = (plus - minus) / 2
+        each = "; ".join(f"{x:+.3f}, {y:+.3f}" for x, y in odd)
+        print(f"{label:8s} {odd[:, 0].mean():+.3f}, {odd[:, 1].mean():+.3f}   ({each})")
 
 
 def print_table(rows: list[Line]) -> None:
@@ -156,8 +208,19 @@ def main() -> None:
     parser = study_parser(__doc__, "revolt-shwfs", 1)
     parser.add_argument("--pokes", type=int, default=1500)
     parser.add_argument("--settling", type=float, default=0.0, help="time constant in exposures")
+    parser.add_argument("--frames", type=int, help="frames of DO-CRIME under turbulence")
+    parser.add_argument("--name", default="turbulence", help="name of that raw table")
     parser.add_argument("--set", dest="overrides", nargs="*", default=[])
     options = parser.parse_args()
+    if options.frames is not None:
+        rows = each_realisation(
+            options.out / f"{options.system}-{options.name}.jsonl",
+            {"system": options.system, "frames": options.frames, "set": options.overrides},
+            realisation_numbers(options),
+            lambda number: run_under_turbulence(options.system, number, options.frames, options.overrides),
+        )
+        print_odd_parts(rows)
+        return
     rows = each_realisation(
         options.out / f"{options.system}{'-settling' if options.settling else ''}.jsonl",
         {
