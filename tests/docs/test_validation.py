@@ -8,8 +8,8 @@ from pages import ROOT
 
 FOLDER = ROOT / "docs" / "studies" / "validation"
 SYSTEMS = {"razor-shwfs", "razor-pywfs", "revolt-shwfs", "maps-nir", "maps-vis"}
-#: Tables of earlier commits, whose statistics the page quotes.
-EARLIER = sorted(FOLDER.glob("realisations-*.jsonl"))
+#: Tables of mirrors of another family.
+OTHERS = sorted(FOLDER.glob("realisations-*.jsonl"))
 #: Largest error that is vouched for, in standard errors.
 MAX_PULL = 4.0
 
@@ -39,11 +39,9 @@ def test_none_is_vouched_for_and_wrong_by_more_than_the_page_says(validation):
         assert np.abs(pulls).max() < MAX_PULL, name
 
 
-@pytest.mark.parametrize("table", EARLIER, ids=lambda path: path.stem)
-def test_the_page_quotes_the_earlier_tables(validation, table, capsys):
+@pytest.mark.parametrize("table", OTHERS, ids=lambda path: path.stem)
+def test_those_of_mirrors_of_another_family_neither(validation, table):
     rows = validation.read_lines(table)
-    validation.print_table(rows)
-    assert capsys.readouterr().out.rstrip() in (ROOT / "docs" / "studies" / "validation.md").read_text()
     pulls = [np.divide(row["error"], row["sigma"]) for row in rows if row["converged"]]
     assert np.abs(pulls).max() < MAX_PULL
 

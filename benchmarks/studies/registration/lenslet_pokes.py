@@ -49,8 +49,8 @@ from escape_sim.models.shack_hartmann import ShackHartmannModel
 
 #: Fractions of the configured poke.
 FRACTIONS = (0.25, 0.5, 1.0)
-#: Fits: weights around tilts, around pokes, and around pokes of a mirror that settles.
-LABELS = ("nominal", "pokes", "settling")
+#: Fits by their names in a line: weights around tilts, pokes, and pokes of a mirror that settles.
+LABELS = {"nominal": "tilts alone", "pokes": "around the pokes", "settling": "with the poke before"}
 #: Shift along x and y with ``--frames``, in % of a sub-aperture, and its names in a line.
 SHIFT, SIDES = 25.0, ("plus", "minus")
 #: Times during an exposure at which the image of a mirror that settles is computed.
@@ -187,20 +187,27 @@ def run_under_turbulence(system: str, number: int, frames: int, overrides: list[
 
 
 def print_odd_parts(rows: list[Line]) -> None:
-    """Half the difference of the errors of the shifts in % of a sub-aperture, by response: mean, and each."""
-    for label in LABELS[1:]:
+    """A Markdown table of half the difference of the errors of the shifts in % of a sub-aperture."""
+    print("| response | mean | by seed |")
+    print("|---|---|---|")
+    for label in (one for one in LABELS if one in rows[0][SIDES[0]]):
         plus, minus = (np.array([row[side][label]["error"][:2] for row in rows]) for side in SIDES)
         odd = (plus - minus) / 2
-        each = "; ".join(f"{x:+.3f}, {y:+.3f}" for x, y in odd)
-        print(f"{label:8s} {odd[:, 0].mean():+.3f}, {odd[:, 1].mean():+.3f}   ({each})")
+        print(f"| {LABELS[label]} | {_pair(odd.mean(axis=0))} | {'; '.join(map(_pair, odd))} |")
 
 
 def print_table(rows: list[Line]) -> None:
-    """Mean error of the shifts in % of a sub-aperture, by fraction and model."""
+    """A Markdown table of the mean errors of the shifts in % of a sub-aperture, by poke and response."""
+    labels = [one for one in LABELS if one in rows[0]["fractions"][0]]
+    print(f"| poke, of the configured | {' | '.join(LABELS[one] for one in labels)} |")
+    print("|---|" + "---|" * len(labels))
     for k, fraction in enumerate(FRACTIONS):
-        for label in (one for one in LABELS if one in rows[0]["fractions"][k]):
-            errors = np.array([row["fractions"][k][label]["error"][:2] for row in rows])
-            print(fraction, label, np.round(errors.mean(axis=0), 3).tolist())
+        errors = (np.array([row["fractions"][k][one]["error"][:2] for row in rows]) for one in labels)
+        print(f"| {fraction:g} | {' | '.join(_pair(one.mean(axis=0)) for one in errors)} |")
+
+
+def _pair(values: NDArray[np.float64]) -> str:
+    return "{:+.3f}, {:+.3f}".format(*values)
 
 
 def main() -> None:
@@ -225,7 +232,7 @@ def main() -> None:
         options.out / f"{options.system}{'-settling' if options.settling else ''}.jsonl",
         {
             "system": options.system, "pokes": options.pokes, "set": options.overrides,
-            "settling": options.settling,
+            **({"settling": options.settling} if options.settling else {}),
         },
         realisation_numbers(options),
         lambda number: run_realisation(
