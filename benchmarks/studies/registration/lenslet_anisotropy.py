@@ -6,8 +6,8 @@ Each realisation, as in ``registration_errors.py``, is measured once with DO-CRI
 by push-pull without it. SPRINT fits both with the anisotropy as a variant of the model and without it;
 DO-CRIME's matrix also without it from the y slopes alone, and from the x slopes alone. Writes
 ``SYSTEM.jsonl``, a line per realisation. Prints the mean errors of the scalings in % of the diameter with the
-standard error of that mean, by how many % influence functions are narrower along a slope than across it, and
-the smallest and largest change by leaving slopes out. A realisation takes half a minute of a core.
+standard error of that mean, by how many % influence functions are narrower along a slope and wider across it,
+and the smallest and largest change by leaving slopes out. A realisation takes half a minute of a core.
 """
 
 from __future__ import annotations
@@ -81,24 +81,26 @@ def run_realisation(system: str, number: int, frames: int) -> Line:
 
 
 def print_table(rows: list[Line]) -> None:
-    """Markdown table of the errors of both scalings, then changes by leaving slopes out, and anisotropies."""
+    """Markdown tables: errors of both scalings and anisotropy by fit, and changes by leaving slopes out."""
 
     def of(label: str, key: str) -> NDArray[np.float64]:
         return np.array([row["fits"][label][key] for row in rows])
 
-    print("| fit | radial [%] | tangential [%] | narrower along than across [%] |")
+    def mean(values: NDArray[np.float64], places: str) -> str:
+        return f"{values.mean():{places}} ± {values.std(ddof=1) / np.sqrt(len(rows)):{places.lstrip('+')}}"
+
+    print("| fit | radial [%] | tangential [%] | narrower along, wider across [%] |")
     print("|---|---:|---:|---:|")
     for label in rows[0]["fits"]:
-        errors = of(label, "error")[:, 3:]
-        means, scatter = errors.mean(axis=0), errors.std(axis=0, ddof=1) / np.sqrt(len(rows))
-        cells = [f"{mean:+.3f} ± {error:.3f}" for mean, error in zip(means, scatter, strict=True)]
-        narrower = -200 * of(label, "anisotropy")
-        cells.append(f"{narrower.min():.2f} to {narrower.max():.2f}" if "with " in label else "–")
+        cells = [mean(errors, "+.3f") for errors in of(label, "error")[:, 3:].T]
+        cells.append(mean(-100 * of(label, "anisotropy"), ".2f") if "with " in label else "–")
         print(f"| {label} | {' | '.join(cells)} |")
-    for label in (NO_X, NO_Y):
+    print("\n| left out | change of the radial scaling [%] | of the tangential one [%] |")
+    print("|---|---:|---:|")
+    for label, name in ((NO_X, "x slopes"), (NO_Y, "y slopes")):
         change = (of(label, "error") - of(WITHOUT, "error"))[:, 3:]
         radial, tangential = (f"{one.min():+.3f} to {one.max():+.3f}" for one in change.T)
-        print(f"{label}: radial {radial}, tangential {tangential}")
+        print(f"| {name} | {radial} | {tangential} |")
 
 
 def main() -> None:
