@@ -65,14 +65,18 @@ def test_what_a_tested_version_needs_is_tested_too() -> None:
         assert name in tested
         for extra in {"", *requirement.extras} - {extra for one, extra in seen if one == name}:
             seen.add((name, extra))
-            with contextlib.suppress(importlib.metadata.PackageNotFoundError):
-                if importlib.metadata.version(name) == tested[name]:
-                    waiting += [
-                        one
-                        for one in map(Requirement, importlib.metadata.requires(name) or ())
-                        if one.marker is None or one.marker.evaluate({"python_version": "3.11", "extra": extra})
-                    ]
+            waiting += requirements_of(name, tested[name], extra)
     assert len(seen) > len(PROJECT["dependencies"])
+
+
+def requirements_of(name: str, version: str, extra: str) -> list[Requirement]:
+    """What this version of a package needs with Python 3.11; nothing if it is not installed here."""
+    with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+        if importlib.metadata.version(name) == version:
+            needed = map(Requirement, importlib.metadata.requires(name) or ())
+            case = {"python_version": "3.11", "extra": extra}
+            return [one for one in needed if one.marker is None or one.marker.evaluate(case)]
+    return []
 
 
 def test_the_oldest_versions_are_those_of_the_project() -> None:
