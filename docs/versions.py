@@ -27,7 +27,7 @@ def describe_checkout() -> tuple[str, str]:
         return subprocess.run(command, check=True, capture_output=True, text=True).stdout
 
     try:
-        commit, tags = git("log", "-1", "--format=%h of %cs"), git("tag", "--points-at", "HEAD")
+        commit, tags = git("log", "-1", "--format=%h, %cs"), git("tag", "--points-at", "HEAD")
     except (OSError, subprocess.CalledProcessError):
         return __version__, ""
     releases = re.findall(r"^v(\d+\.\d+\.\d+)$", tags, re.MULTILINE)

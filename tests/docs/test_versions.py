@@ -17,7 +17,7 @@ ROOT = Path(__file__).resolve().parents[2]
 RELEASE = escape_hw.__version__
 VERSIONS = runpy.run_path(str(ROOT / "docs" / "versions.py"))
 
-pytestmark = pytest.mark.skipif(shutil.which("git") is None, reason="git is not installed")
+pytestmark = pytest.mark.skipif(None in map(shutil.which, ("git", "make")), reason="needs git and make")
 
 
 def git(folder: Path, *words: str) -> str:
@@ -74,7 +74,7 @@ def test_a_published_version_stays_beside_later_states(checkout: Path) -> None:
 
 def test_a_tag_is_that_of_the_package(checkout: Path, tmp_path: Path) -> None:
     describe = runpy.run_path(str(checkout / "docs" / "versions.py"))["describe_checkout"]
-    commit = git(checkout, "log", "-1", "--format=%h of %cs")
+    commit = git(checkout, "log", "-1", "--format=%h, %cs")
     assert describe() == ("development", commit)
     git(checkout, "tag", f"v{RELEASE}")
     assert describe() == (RELEASE, commit)
