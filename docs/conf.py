@@ -8,12 +8,12 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).parent))
 
 import site_reference
-
-import escape_hw
+import versions
 
 project = "ESCAPE"
 author = "the ESCAPE authors"
-version = release = escape_hw.__version__
+release, commit = versions.describe_checkout()
+version = release
 extensions = [
     "myst_parser",
     "sphinx.ext.autodoc",
@@ -34,6 +34,8 @@ napoleon_use_rtype = False
 exclude_patterns = ["_build"]
 html_theme = "furo"
 html_title = f"ESCAPE {release}"
+html_context = {"commit": commit}
+templates_path = ["_templates"]
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
 copybutton_exclude = ".linenos, .gp, .go"

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import configparser
+import contextlib
+import importlib.metadata
 import re
 import subprocess
 import sys
@@ -30,6 +32,13 @@ def pins(lines: str) -> dict[str, str]:
     return {canonicalize_name(name): version for name, version in found}
 
 
+def requirements(*extras: str) -> list[Requirement]:
+    """Requirements of the package and of some of its extras, without those that name the package itself."""
+    groups = [PROJECT["dependencies"], *(PROJECT["optional-dependencies"][name] for name in extras)]
+    found = [Requirement(one) for group in groups for one in group]
+    return [one for one in found if one.name != PROJECT["name"]]
+
+
 def test_every_place_has_the_same_version() -> None:
     newest = re.search(r"^## \[(\d+\.\d+\.\d+)\] - (\d{4}-\d\d-\d\d)$", text("CHANGELOG.md"), re.MULTILINE)
     citation = dict(
@@ -42,14 +51,32 @@ def test_every_place_has_the_same_version() -> None:
 
 def test_tested_versions_satisfy_every_requirement() -> None:
     tested = pins(text("constraints.txt"))
-    extras = PROJECT["optional-dependencies"]
-    wanted = [
-        *PROJECT["dependencies"],
-        *(one for name in ("gui", "sweep", "test", "docs", "dev", *ALL) for one in extras[name]),
-    ]
-    for requirement in map(Requirement, wanted):
-        if requirement.name != PROJECT["name"]:
-            assert tested[canonicalize_name(requirement.name)] in requirement.specifier, requirement
+    for requirement in requirements("gui", "sweep", "test", "docs", "dev", *ALL):
+        assert tested[canonicalize_name(requirement.name)] in requirement.specifier, requirement
+
+
+def test_what_a_tested_version_needs_is_tested_too() -> None:
+    """As far as the tested versions are installed here; others may need other packages."""
+    tested = pins(text("constraints.txt"))
+    waiting, seen = requirements("gui", "sweep", "test", "docs", "dev", *ALL), set()
+    while waiting:
+        requirement = waiting.pop()
+        name = canonicalize_name(requirement.name)
+        assert name in tested
+        for extra in {"", *requirement.extras} - {extra for one, extra in seen if one == name}:
+            seen.add((name, extra))
+            waiting += requirements_of(name, tested[name], extra)
+    assert len(seen) > len(PROJECT["dependencies"])
+
+
+def requirements_of(name: str, version: str, extra: str) -> list[Requirement]:
+    """What this version of a package needs with Python 3.11; nothing if it is not installed here."""
+    with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+        if importlib.metadata.version(name) == version:
+            needed = map(Requirement, importlib.metadata.requires(name) or ())
+            case = {"python_version": "3.11", "extra": extra}
+            return [one for one in needed if one.marker is None or one.marker.evaluate(case)]
+    return []
 
 
 def test_the_oldest_versions_are_those_of_the_project() -> None:
@@ -61,7 +88,7 @@ def test_the_oldest_versions_are_those_of_the_project() -> None:
         timeout=60,
     )
     oldest = pins(done.stdout)
-    for requirement in map(Requirement, PROJECT["dependencies"]):
+    for requirement in requirements(*PROJECT["optional-dependencies"]):
         version = oldest[canonicalize_name(requirement.name)].removesuffix(".*")
         assert version in requirement.specifier
         assert f">={version}" in str(requirement.specifier)
