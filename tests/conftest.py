@@ -1,5 +1,7 @@
 """Options of the whole suite."""
 
+import signal
+
 import campaign_table
 import hardware_option
 import pytest
@@ -9,6 +11,10 @@ from hypothesis import HealthCheck, settings
 from study_scripts import import_study
 
 __all__ = ["import_study", "pytest_addoption", "pytest_configure", "pytest_terminal_summary"]
+
+# Shells start background jobs with Ctrl-C ignored, and Python keeps that.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # How long an example takes says how busy the computer is, not whether the code is right.
 settings.register_profile("untimed", deadline=None, suppress_health_check=[HealthCheck.too_slow])

@@ -23,6 +23,10 @@ EVERY = sorted(
 )
 
 
+#: Longest that a command of a page may take, on a computer that does other work as well.
+_LONGEST_S = 1800
+
+
 @dataclass(frozen=True)
 class Block:
     """A fenced block: its language, the words behind it, its lines."""
@@ -47,9 +51,9 @@ def call(words: list[str], folder: Path) -> subprocess.CompletedProcess[str]:
     """Run a program in a folder that is also where the user's data go; Python has its imports."""
     environment = {**os.environ, "PYTHONIOENCODING": "utf-8", "XDG_DATA_HOME": str(folder / "data")}
     if words[0] == sys.executable and words[1] != "-m":
-        return preloaded.run(words[1:], environment, folder, 600)
+        return preloaded.run(words[1:], environment, folder, _LONGEST_S)
     return subprocess.run(
-        words, cwd=folder, capture_output=True, text=True, timeout=600, check=False, env=environment
+        words, cwd=folder, capture_output=True, text=True, timeout=_LONGEST_S, check=False, env=environment
     )
 
 

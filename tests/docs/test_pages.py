@@ -70,7 +70,7 @@ def test_a_quotation_is_compared_with_the_output() -> None:
 
 
 @pytest.mark.campaign
-@pytest.mark.timeout(1800)
+@pytest.mark.timeout(3600)
 @pytest.mark.parametrize("page", [page for page in RUN if has_slow_blocks(page)], ids=name_of)
 def test_a_page_can_be_followed_to_its_end(
     page: Path, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory

@@ -9,6 +9,7 @@ import pytest
 from numpy.typing import NDArray
 from small_pyramid import configuration as small_pyramid
 
+from escape_hw.api.forwarding import Forwarding
 from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.pyramid import PyramidPupils
 from escape_hw.api.registration import Registration
@@ -21,14 +22,14 @@ from escape_sim.models.pyramid import PyramidModel, nominal_pupils
 NOISE = 0.05
 
 
-class Selective:
+class Selective(Forwarding):
     """The same model with a weight per slope."""
 
-    def __init__(self, model: PyramidModel, weights: NDArray[np.float64]) -> None:
-        self._model, self.slope_weights = model, weights
+    slope_weights: NDArray[np.float64] = np.ones(0)
 
-    def __getattr__(self, name: str) -> object:
-        return getattr(self._model, name)
+    def __init__(self, model: PyramidModel, weights: NDArray[np.float64]) -> None:
+        super().__init__(model)
+        self.slope_weights = weights
 
 
 def contaminated(pupils: PyramidPupils) -> NDArray[np.bool_]:

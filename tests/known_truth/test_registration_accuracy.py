@@ -114,7 +114,8 @@ def test_thirty_registrations_short_and_two_seconds() -> None:
             assert _meets_goal(curves, estimator, frames)
             at = curves["frames"].index(frames)
             for name in PARAMETERS:
-                # The matrix route states its rotation half as large again as it errs (decision 7).
-                least = 0.5 if estimator == "telemetry" else 0.35
+                # The matrix route states shift and rotation up to twice as large as it errs on mirrors
+                # that are nearly as its model has them: its errors contain those of other mirrors.
+                least = 0.5 if estimator == "telemetry" else 0.25
                 assert least <= curves["chi2"][estimator][name][at] <= 2.0, (estimator, frames, name)
     assert (np.array([curves["bound"][p][0] for p in PARAMETERS]) < GOAL).all()

@@ -9,6 +9,7 @@ from scipy import ndimage
 from small_pyramid import configuration as small_pyramid
 from small_system import configuration as small_lenslets
 
+from escape_hw.api.forwarding import Forwarding
 from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.procedure import run
 from escape_hw.api.registration import Registration
@@ -25,16 +26,10 @@ NOISE = 0.3
 TREND = np.array([0.09, 0.29, 0.22, 0.07])
 
 
-class Even:
+class Even(Forwarding):
     """The same model, sure that its slopes have no trend."""
 
     gain_trend = 0.0
-
-    def __init__(self, model: PyramidModel) -> None:
-        self._model = model
-
-    def __getattr__(self, name: str) -> object:
-        return getattr(self._model, name)
 
 
 @pytest.fixture(scope="module")

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from escape_hw.api.forwarding import Forwarding
 from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.procedure import run
 from escape_hw.api.registration import Registration
@@ -39,17 +40,11 @@ class Dull:
         )
 
 
-class ModelWithVariant:
+class ModelWithVariant(Forwarding):
     """A model with one variant, of a less sensitive sensor."""
 
-    def __init__(self, sharp: SyntheticModel) -> None:
-        self._sharp = sharp
-
     def variants(self) -> list[Dull]:
-        return [Dull(self._sharp)]
-
-    def __getattr__(self, name: str) -> object:
-        return getattr(self._sharp, name)
+        return [Dull(self.original)]
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from escape_hw.api.forwarding import Forwarding
 from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.registration import Registration
 from escape_hw.api.synthetic_model import SyntheticModel
@@ -44,65 +45,66 @@ def remove_tip_tilt(slopes: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray((axes - axes.mean(axis=-2, keepdims=True)).reshape(slopes.shape))
 
 
-class TipTiltFreeModel:
+class TipTiltFreeModel(Forwarding):
     """A differentiable synthetic model whose slopes have no mean.
 
     Parameters
     ----------
-    model
-        The model of a sensor that keeps them; its other attributes are passed on.
+    original
+        The model of a sensor that keeps them; its other members are passed on.
     """
 
-    def __init__(self, model: SyntheticModel) -> None:
-        self._model: Any = model
+    def __init__(self, original: SyntheticModel) -> None:
+        super().__init__(original)
 
     def zonal_matrix(self, registration: Registration, width: float = 1.0) -> NDArray[np.float64]:
         """Slopes per unit command ``(n_slopes, n_act)``."""
-        return remove_tip_tilt(self._model.zonal_matrix(registration, width))
+        return remove_tip_tilt(self.original.zonal_matrix(registration, width))
 
     def zonal_sum(
         self, functions: Sequence[tuple[NDArray[np.float64] | float, Registration, float]]
     ) -> NDArray[np.float64]:
         """Slopes of a sum of influence functions per unit command ``(n_slopes, n_act)``."""
-        return remove_tip_tilt(zonal_sum(self._model, functions))
+        return remove_tip_tilt(zonal_sum(self.original, functions))
 
     def zonal_components(
         self, registration: Registration, width: float, functions: Sequence[tuple[float, float]]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Slopes of influence functions of several widths, and derivatives of their sum."""
-        matrices, derivatives = zonal_components(self._model, registration, width, functions)
+        matrices, derivatives = zonal_components(self.original, registration, width, functions)
         return remove_tip_tilt(matrices), remove_tip_tilt(derivatives)
 
     def zonal_jacobian(
         self, registration: Registration, width: float = 1.0
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Zonal matrix and its derivatives ``(6, n_slopes, n_act)``."""
-        matrix, derivatives = zonal_jacobian(self._model, registration, width)
+        matrix, derivatives = zonal_jacobian(self.original, registration, width)
         return remove_tip_tilt(matrix), remove_tip_tilt(derivatives)
 
     def modal_matrix(
         self, registration: Registration, m2c: NDArray[np.float64], width: float = 1.0
     ) -> NDArray[np.float64]:
         """Slopes per unit mode ``(n_slopes, n_modes)``."""
-        return remove_tip_tilt(modal_matrix(self._model, registration, m2c, width))
+        return remove_tip_tilt(modal_matrix(self.original, registration, m2c, width))
 
     def modal_jacobian(
         self, registration: Registration, m2c: NDArray[np.float64], width: float = 1.0
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Modal matrix and its derivatives ``(6, n_slopes, n_modes)``."""
-        matrix, derivatives = modal_jacobian(self._model, registration, m2c, width)
+        matrix, derivatives = modal_jacobian(self.original, registration, m2c, width)
         return remove_tip_tilt(matrix), remove_tip_tilt(derivatives)
 
     def variants(self) -> Sequence[TipTiltFreeModel]:
         """The model's variants, treated alike."""
-        return [TipTiltFreeModel(variant) for variant in self._model.variants()]
+        return [TipTiltFreeModel(variant) for variant in self.original.variants()]
 
     def component_model(self) -> TipTiltFreeModel:
         """The model of one function of the profile, treated alike."""
-        return TipTiltFreeModel(self._model.component_model())
+        return TipTiltFreeModel(self.original.component_model())
 
-    def __getattr__(self, name: str) -> Any:
-        attribute = getattr(self._model, name)
+    def passed_on(self, name: str) -> Any:
+        """A member of the model; models that it makes are treated alike."""
+        attribute = super().passed_on(name)
         if name not in ("with_pupil_shift", "around_pokes"):
             return attribute
 

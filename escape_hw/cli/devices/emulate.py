@@ -67,9 +67,12 @@ def _serve(context: CommandContext, name: str, emulator: Emulator, seconds: floa
     address = emulator.start()
     try:
         context.notify(f"{name}: {address}")
-        while deadline is None or time.monotonic() < deadline:
+        while True:
             n_reported = _report_new_violations(context, name, emulator, n_reported)
-            time.sleep(_POLL_S if deadline is None else min(_POLL_S, max(deadline - time.monotonic(), 0)))
+            left = _POLL_S if deadline is None else deadline - time.monotonic()
+            if left <= 0:
+                break
+            time.sleep(min(_POLL_S, left))
     except KeyboardInterrupt:
         context.notify(f"{name}: stopped")
     finally:
