@@ -6,8 +6,9 @@ import pytest
 from campaign_table import pytest_terminal_summary
 from hardware_option import pytest_configure
 from hypothesis import HealthCheck, settings
+from study_scripts import import_study
 
-__all__ = ["pytest_addoption", "pytest_configure", "pytest_terminal_summary"]
+__all__ = ["import_study", "pytest_addoption", "pytest_configure", "pytest_terminal_summary"]
 
 # How long an example takes says how busy the computer is, not whether the code is right.
 settings.register_profile("untimed", deadline=None, suppress_health_check=[HealthCheck.too_slow])

@@ -108,7 +108,10 @@ def test_mistakes_are_reported_as_shown(tmp_path: Path) -> None:
     assert told == shown
 
 
-@pytest.mark.parametrize("document", ["README.md", *(str(page.relative_to(ROOT)) for page in EVERY)])
+@pytest.mark.parametrize(
+    "document",
+    ["README.md", "benchmarks/studies/README.md", *(str(page.relative_to(ROOT)) for page in EVERY)],
+)
 def test_links_lead_somewhere(document: str) -> None:
     path = ROOT / document
     text = path.read_text(encoding="utf-8")

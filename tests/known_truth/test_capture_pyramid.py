@@ -1,6 +1,6 @@
 """A pyramid from two actuator pitches and ten degrees away.
 
-`benchmarks/studies/capture_range.py` does a hundred.
+`benchmarks/studies/registration/capture_range.py` does a hundred.
 """
 
 from __future__ import annotations

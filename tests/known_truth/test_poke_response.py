@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,14 +12,10 @@ from escape_hw.calibration.sprint.tip_tilt import TipTiltFreeModel
 from escape_hw.config.loader import load_system
 from escape_sim.models.shack_hartmann import ShackHartmannModel, exposure_parts, nominal_grid
 
-STUDIES = Path(__file__).parents[2] / "benchmarks" / "studies"
-
 
 @pytest.mark.slow
-def test_shift_from_images_of_pokes(monkeypatch):
-    monkeypatch.syspath_prepend(STUDIES)
-    from lenslet_pokes import run_realisation
-
+def test_shift_from_images_of_pokes(import_study):
+    run_realisation = import_study("registration/lenslet_pokes.py").run_realisation
     (row,) = run_realisation("revolt-shwfs", 1, 400, [], fractions=(1.0,))["fractions"]
     # Without noise; the random pokes themselves scatter by 0.03 %.
     assert np.abs(row["pokes"]["error"][:2]).max() < 0.1
@@ -28,10 +23,8 @@ def test_shift_from_images_of_pokes(monkeypatch):
 
 
 @pytest.mark.slow
-def test_shift_from_images_of_a_mirror_that_settles(monkeypatch):
-    monkeypatch.syspath_prepend(STUDIES)
-    from lenslet_pokes import run_realisation
-
+def test_shift_from_images_of_a_mirror_that_settles(import_study):
+    run_realisation = import_study("registration/lenslet_pokes.py").run_realisation
     (row,) = run_realisation("revolt-shwfs", 1, 400, [], fractions=(1.0,), settling=0.17)["fractions"]
     errors = {name: np.hypot(*row[name]["error"][:2]) for name in ("nominal", "pokes", "settling")}
     assert errors["settling"] < 0.9 * errors["pokes"] < 0.45 * errors["nominal"]

@@ -1,0 +1,52 @@
+"""Pages of studies state what their commands print of the raw tables."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import sys
+
+import pytest
+from pages import EVERY, ROOT
+
+from escape_benchmarks.realisation_tables import read_lines
+from escape_hw.runtime.session.system import System
+
+#: Scripts that only print, if their raw table has all realisations.
+SCRIPTS = (
+    "capture_range", "constants", "lenslet_anisotropy", "lenslet_pokes", "nuisances", "registration_errors",
+)  # fmt: skip
+COMMAND = re.compile(
+    rf"^python (benchmarks/studies/registration/(?:{'|'.join(SCRIPTS)})\.py .*--out docs/.*)$", re.MULTILINE
+)
+TEXTS = [page.read_text(encoding="utf-8") for page in EVERY]
+QUOTED = [(text, command) for text in TEXTS for command in COMMAND.findall(text)]
+#: First realisation of a study, by the folder of its raw tables.
+FIRST = {"capture": 0, "constants": 1000, "nuisances": 2000}
+
+
+@pytest.mark.parametrize(("text", "command"), QUOTED, ids=[command for _, command in QUOTED])
+def test_a_page_has_what_its_command_prints(text, command, capsys, monkeypatch, import_study):
+    monkeypatch.setattr(System, "from_config", None)  # nothing is measured
+    monkeypatch.chdir(ROOT)
+    words = shlex.split(command)
+    monkeypatch.setattr(sys, "argv", words)
+    import_study(words[0].removeprefix("benchmarks/studies/")).main()
+    assert capsys.readouterr().out.rstrip() in text
+
+
+def test_every_script_is_quoted():
+    assert {command.split(".py")[0].rpartition("/")[2] for _, command in QUOTED} == set(SCRIPTS)
+
+
+@pytest.mark.parametrize("folder", FIRST)
+def test_the_realisations_are_those_of_the_study_and_of_one_commit(folder):
+    tables = (ROOT / "docs" / "studies" / folder).glob("*.jsonl")
+    rows = [row for table in tables for row in read_lines(table)]
+    assert min(row["realisation"] for row in rows) == FIRST[folder]
+    assert len({row["commit"] for row in rows}) == 1
+
+
+def test_no_realisation_of_the_capture_range_is_wrong():
+    (table,) = (ROOT / "docs" / "studies" / "capture").glob("*.jsonl")
+    assert [row["outcome"] for row in read_lines(table)] == ["recovered"] * 100
