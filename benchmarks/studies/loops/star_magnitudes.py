@@ -6,8 +6,8 @@
 Both matrices come from the same frames. Each seed is a twin with a mirror and turbulence of its own, the
 same at all magnitudes, and each matrix is closed at its own best gain on equal turbulence
 (``loop_comparison.py``): ESCAPE's scaled by its optical gains, or as calibrated where these are refused. A
-calibration that is refused counts as a Strehl ratio of zero, its message is kept. The mean of ``--sky-frames``
-frames beside the star is subtracted from every frame; with 0, one level for all pixels.
+calibration that is refused counts as a Strehl ratio of zero, its message is kept. The mean of
+``--sky-frames`` frames beside the star is subtracted from every frame; with 0, one level for all pixels.
 Prints the table and draws ``SYSTEM.png`` beside the raw tables ``SYSTEM-MAGNITUDE.jsonl``. A seed takes two
 minutes of an idle core. The other options are those of ``loop_comparison.py``.
 """
