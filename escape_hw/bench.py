@@ -7,7 +7,8 @@ import zlib
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, Self, TypeVar
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +22,7 @@ from escape_hw.api.modulator import TipTiltModulator
 from escape_hw.api.phase_screen import PhaseScreen
 from escape_hw.api.sensor import SensorGeometry
 from escape_hw.api.synthetic_model import SyntheticModel
-from escape_hw.config.devices import CameraConfig, DeviceConfig, MirrorConfig
+from escape_hw.config.devices import CameraConfig, DeviceConfig, MirrorConfig, SensorCameraConfig
 from escape_hw.config.registry import (
     DeviceContext,
     call_factory,
@@ -31,7 +32,7 @@ from escape_hw.config.registry import (
 )
 from escape_hw.config.system import SystemConfig
 from escape_hw.deprecation import renamed_members
-from escape_hw.errors import ConfigError
+from escape_hw.errors import ConfigError, ProductError
 from escape_hw.safety.limits import CAUTIOUS_LIMITS
 
 if TYPE_CHECKING:
@@ -95,7 +96,8 @@ class Bench:
         Raises
         ------
         ConfigError
-            A driver or twin is unknown, not installed, or of the wrong kind.
+            A driver or twin is unknown, not installed, or of the wrong kind; or the dark frame or flat of the
+            sensor's camera cannot be read, or is of another region.
         """
         shared: dict[str, object] = {}
         devices = config.devices
@@ -108,7 +110,10 @@ class Bench:
             name, mode = ("dm", devices.dm.mode) if dm is None else ("wfs", devices.wfs.mode)
             key = "sim_driver" if (mode or config.system.mode) == "sim" else "driver"
             raise ConfigError(f"devices.{name}.{key}: ''  names no driver; every system needs this device")
-        return cls(config, dm, wfs, science, screen, modulator)
+        bench = cls(config, dm, wfs, science, screen, modulator)
+        bench.dark = _read_pixels(devices.wfs, "dark_file")
+        bench.flat = _read_pixels(devices.wfs, "flat_file")
+        return bench
 
     def __repr__(self) -> str:
         kind = "simulated" if self.simulated else "hardware"
@@ -316,6 +321,29 @@ def open_device(driver: str, /, **settings: Any) -> Device:
 def resolve_mode(section: DeviceConfig, config: SystemConfig) -> str:
     """Mode of a device: its own, or the system's if it has none."""
     return section.mode or config.system.mode
+
+
+def _read_pixels(
+    camera: SensorCameraConfig, key: Literal["dark_file", "flat_file"]
+) -> NDArray[np.float32] | None:
+    """The dark frame or flat that a key of the configuration names, ``(rows, columns)``."""
+    path = getattr(camera, key)
+    if not path:
+        return None
+    # Reading FITS files takes longer than opening a bench without any.
+    from escape_hw.io.fits.pixels import load_pixels
+
+    try:
+        image = load_pixels(Path(path).expanduser(), "DARK" if key == "dark_file" else "FLAT").result
+    except ProductError as error:
+        raise ConfigError(f"devices.wfs.{key}: {error}") from error
+    _, _, width, height = camera.region
+    if image.shape != (height, width):
+        raise ConfigError(
+            f"devices.wfs.{key}: {path} has {image.shape[1]} x {image.shape[0]} pixels, devices.wfs.region "
+            f"{width} x {height}; measure it again"
+        )
+    return image
 
 
 def _build(

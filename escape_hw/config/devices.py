@@ -381,6 +381,19 @@ class CameraConfig(DeviceConfig):
         return self
 
 
+class SensorCameraConfig(CameraConfig):
+    """The camera of the wavefront sensor."""
+
+    dark_file: str = Field(
+        "",
+        description="dark.fits of `escape dark`, subtracted from every frame; on a star, frames beside it; "
+        "absent: one level for all pixels",
+    )
+    flat_file: str = Field(
+        "", description="flat.fits of `escape flat`, which every frame is divided by; absent: none"
+    )
+
+
 class ScienceConfig(CameraConfig):
     """The science camera, which records the point-spread function."""
 
@@ -441,7 +454,7 @@ class DevicesConfig(Section):
     """The devices of a system."""
 
     dm: MirrorConfig = Field(description="deformable mirror")
-    wfs: CameraConfig = Field(description="camera of the wavefront sensor")
+    wfs: SensorCameraConfig = Field(description="camera of the wavefront sensor")
     science: ScienceConfig | None = Field(None, description="science camera; absent: none")
     screen: ScreenConfig | None = Field(None, description="phase screens; absent: none")
     modulator: ModulatorConfig | None = Field(

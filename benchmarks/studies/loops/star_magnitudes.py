@@ -6,7 +6,8 @@
 Both matrices come from the same frames. Each seed is a twin with a mirror and turbulence of its own, the
 same at all magnitudes, and each matrix is closed at its own best gain on equal turbulence
 (``loop_comparison.py``): ESCAPE's scaled by its optical gains, or as calibrated where these are refused. A
-calibration that is refused counts as a Strehl ratio of zero, its message is kept.
+calibration that is refused counts as a Strehl ratio of zero, its message is kept. The mean of
+``--sky-frames`` frames beside the star is subtracted from every frame; with 0, one level for all pixels.
 Prints the table and draws ``SYSTEM.png`` beside the raw tables ``SYSTEM-MAGNITUDE.jsonl``. A seed takes two
 minutes of an idle core. The other options are those of ``loop_comparison.py``.
 """
@@ -30,18 +31,39 @@ from matplotlib.axes import Axes
 
 from escape_benchmarks.realisation_tables import Line, each_realisation
 from escape_hw.errors import CalibrationError
+from escape_hw.io.run_folder import RunFolder
 from escape_hw.pipeline.statistics import mean_interval
 from escape_hw.report.figures.style import SERIES, legend, new_figure, style_axes
+from escape_hw.runtime.procedures.detector import DarkProcedure
+from escape_hw.runtime.session.record import BenchRecord
+from escape_hw.runtime.session.system import open_system
 
 NAMES = (ESCAPE, DOCRIME)
 
 
+def sky_frame(options: argparse.Namespace, number: int) -> list[str]:
+    """Override that names the mean frame of the sky of a seed, measured unless it is there."""
+    if not options.sky_frames:
+        return []
+    folder = options.out / f"sky-{number}"
+    if not (folder / "dark.fits").exists():
+        # The faintest star of a twin: the telescope points beside any.
+        overrides = [*options.set, "twin.star.magnitude=30"]
+        with (
+            open_system(options.system, seed=number, set=overrides) as bench,
+            RunFolder(options.system, "dark", folder) as run,
+        ):
+            procedure = DarkProcedure(frames=options.sky_frames, blocked_by_hand=True)
+            procedure.save(run, BenchRecord.from_bench(bench), bench.run(procedure), 0.0)
+    return [f'devices.wfs.dark_file="{folder / "dark.fits"}"']
+
+
 def measure_or_refuse(options: argparse.Namespace, number: int, until: float) -> Line:
     """The line of a seed; without optical gains where these are refused, empty where the calibration is."""
-    refused = ""
+    refused, overrides = "", [*options.set, *sky_frame(options, number)]
     for gains in (True, False):
         try:
-            now = argparse.Namespace(**{**vars(options), "gains": gains})
+            now = argparse.Namespace(**{**vars(options), "gains": gains, "set": overrides})
             return {**measure_seed(now, number, until), "refused": refused}
         except CalibrationError as error:
             refused = str(error)
@@ -101,6 +123,7 @@ def main() -> None:
     """Measure what is missing, print the table, and draw the figure."""
     parser = comparison_parser(__doc__, "maps-nir")
     parser.add_argument("--magnitudes", type=float, nargs="+", default=[float(m) for m in range(5, 13)])
+    parser.add_argument("--sky-frames", type=int, default=500)
     parser.set_defaults(baseline=0, seeds=[1, 2, 3])
     options = parser.parse_args()
     tables: dict[float, list[Line]] = {}
@@ -110,7 +133,7 @@ def main() -> None:
     for magnitude in options.magnitudes:
         options.set = [*overrides, f"twin.star.magnitude={magnitude:g}"]
         options.out = out / f"magnitude-{magnitude:g}"
-        asked = complete_options(parser, options)
+        asked = {**complete_options(parser, options), "sky_frames": options.sky_frames}
         target = folder / f"{options.system}-{magnitude:g}.jsonl"
         tables[magnitude] = each_realisation(
             target, asked, options.seeds, lambda number: measure_or_refuse(options, number, until)

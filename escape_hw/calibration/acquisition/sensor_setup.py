@@ -370,8 +370,8 @@ def measure_dark(
         return bench.dark
     if bench.screen is None:
         raise CalibrationError(
-            "this system has no beam stop under remote control; block the beam by hand and say so "
-            "(blocked_by_hand), or set bench.dark"
+            "this system has no beam stop under remote control; block the beam by hand, or point beside the "
+            "star, and say so (blocked_by_hand), or name a dark frame in devices.wfs.dark_file"
         )
     before = bench.screen.state.blocked
     bench.screen.set(blocked=True)
@@ -429,7 +429,7 @@ def measure_flat(bench: Bench, *, frames: int = 100) -> Procedure[NDArray[np.flo
     """
     validate_frame_count(frames)
     if bench.dark is None:
-        raise CalibrationError("there is no dark frame; measure it first")
+        raise CalibrationError("no dark frame: measure it first, or name it in devices.wfs.dark_file")
     mean, _ = yield from _average_frames(bench, frames, "flat")
     bench.flat = compute_flat(mean, bench.dark)
     return bench.flat

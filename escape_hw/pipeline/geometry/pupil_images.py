@@ -229,7 +229,8 @@ def _check_light(
     if not contrast.max() > noise:
         raise CalibrationError(
             "no pupil images on the wavefront sensor, only noise or even light; "
-            "check source, beam stop, exposure and sensor.pupils_px"
+            "check source, beam stop, exposure and sensor.pupils_px; on a faint star measure a dark frame "
+            "beside it (escape dark, devices.wfs.dark_file)"
         )
     share = np.square(np.maximum(contrast, 0.0))
     missing = share < np.maximum(_MIN_LIGHT_FRACTION * np.median(share), noise**2)
@@ -240,7 +241,8 @@ def _check_light(
         )
         raise CalibrationError(
             f"only {4 - int(missing.sum())} of four pupil images on the wavefront sensor; missing: {names}; "
-            "check the beam on the pyramid's tip, the camera region and sensor.pupils_px"
+            "check the beam on the pyramid's tip, the camera region and sensor.pupils_px; on a faint star "
+            "measure a dark frame beside it (escape dark, devices.wfs.dark_file)"
         )
 
 

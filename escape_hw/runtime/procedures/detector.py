@@ -31,14 +31,18 @@ class _PixelProcedure(ProcedureSpec[PixelCalibration]):
         self, folder: RunFolder, record: BenchRecord, result: PixelCalibration, wall_seconds: float
     ) -> SavedRun:
         """Save the image as FITS, and its mean and scatter."""
-        from escape_hw.io.fits import file as fits_file
+        from escape_hw.io.fits.pixels import save_pixels
         from escape_hw.runtime.procedures.products import save_values
 
-        kind, image = self.name.upper(), result.image
-        path = folder.file(f"{self.name}.fits")
-        unit = "count" if kind == "DARK" else ""
-        hdus = [fits_file.image_extension(kind, image, unit)]
-        fits_file.write_product(path, kind, hdus, record.system, record.simulated, record.origin())
+        image, path = result.image, folder.file(f"{self.name}.fits")
+        save_pixels(
+            path,
+            "DARK" if self.name == "dark" else "FLAT",
+            image,
+            record.system,
+            record.simulated,
+            record.origin(),
+        )
         folder.add_product(self.name, path)
         values = {"mean": float(image.mean()), "scatter": float(image.std())}
         return save_values(
