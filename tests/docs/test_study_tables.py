@@ -51,3 +51,14 @@ def test_the_realisations_are_those_of_the_study_and_of_one_commit_for_each_syst
 def test_no_realisation_of_the_capture_range_is_wrong():
     (table,) = (ROOT / "docs" / "studies" / "capture").glob("*.jsonl")
     assert [row["outcome"] for row in read_lines(table)] == ["recovered"] * 100
+
+
+def test_the_page_of_faint_stars_has_its_tables(capsys, import_study):
+    text = (ROOT / "docs" / "studies" / "star-magnitudes.md").read_text(encoding="utf-8")
+    study = import_study("loops/star_magnitudes.py")
+    for folder in (ROOT / "docs" / "studies" / "star-magnitudes" / name for name in ("", "sky", "long")):
+        tables = {float(path.stem.rpartition("-")[2]): read_lines(path) for path in folder.glob("*.jsonl")}
+        study.print_table(dict(sorted(tables.items())))
+        printed = capsys.readouterr().out
+        assert len(tables) == printed.count("\n") - 2
+        assert printed in text

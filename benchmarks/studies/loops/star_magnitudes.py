@@ -133,7 +133,9 @@ def main() -> None:
     for magnitude in options.magnitudes:
         options.set = [*overrides, f"twin.star.magnitude={magnitude:g}"]
         options.out = out / f"magnitude-{magnitude:g}"
-        asked = {**complete_options(parser, options), "sky_frames": options.sky_frames}
+        asked = complete_options(parser, options)
+        if options.sky_frames:
+            asked["sky_frames"] = options.sky_frames
         target = folder / f"{options.system}-{magnitude:g}.jsonl"
         tables[magnitude] = each_realisation(
             target, asked, options.seeds, lambda number: measure_or_refuse(options, number, until)
@@ -143,6 +145,7 @@ def main() -> None:
     left, right = figure.subplots(1, 2)
     _draw_strehl(style_axes(left), tables)
     _draw_shift(style_axes(right), tables)
+    right.set_xlim(left.get_xlim())
     figure.savefig(folder / f"{options.system}.png", dpi=110, facecolor="white")
 
 
