@@ -53,8 +53,9 @@ class ShackHartmannSection(SensorSection):
     )  # fmt: skip
     anisotropy_sigma: float = Field(
         0.02, gt=0, le=0.2,
-        description="SPRINT: relative difference of the widths of influence functions along and across a "
-        "slope, as the lenslets see them; 0.002 on twins with turbulence, and determined by the data",
+        description="SPRINT: relative change of the widths of influence functions along a slope, and the "
+        "opposite one across it, as the lenslets see them; 0.002 on twins with turbulence, and determined by "
+        "the data",
     )  # fmt: skip
     valid: LayoutText | None = Field(
         None,
