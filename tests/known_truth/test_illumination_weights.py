@@ -9,11 +9,11 @@ import pytest
 from numpy.typing import NDArray
 from small_pyramid import configuration as small_pyramid
 
-from escape_hw.api.forwarding import Forwarding
 from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.pyramid import PyramidPupils
 from escape_hw.api.registration import Registration
 from escape_hw.calibration.sprint.fit import sprint
+from escape_hw.calibration.sprint.forwarding import Forwarding
 from escape_hw.config.choices import Solver
 from escape_hw.config.loader import load_system
 from escape_sim.models.pyramid import PyramidModel, nominal_pupils

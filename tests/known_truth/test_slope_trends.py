@@ -9,11 +9,11 @@ from scipy import ndimage
 from small_pyramid import configuration as small_pyramid
 from small_system import configuration as small_lenslets
 
-from escape_hw.api.forwarding import Forwarding
 from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.procedure import run
 from escape_hw.api.registration import Registration
 from escape_hw.calibration.sprint.fit import SprintFit, fit_registration
+from escape_hw.calibration.sprint.forwarding import Forwarding
 from escape_hw.calibration.sprint.mixed_effects import slope_trends
 from escape_sim.models.factory import make_fast_model
 from escape_sim.models.pyramid import PyramidModel, nominal_pupils

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from escape_hw.api.forwarding import Forwarding
 from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.procedure import run
 from escape_hw.api.registration import Registration
 from escape_hw.api.synthetic_model import SyntheticModel
 from escape_hw.calibration.modes.bases import karhunen_loeve
 from escape_hw.calibration.sprint.fit import fit_registration
+from escape_hw.calibration.sprint.forwarding import Forwarding
 from escape_hw.config.loader import load_system
 from escape_sim.models.factory import make_fast_model
 from escape_sim.models.shack_hartmann import nominal_grid

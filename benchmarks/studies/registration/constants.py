@@ -13,7 +13,7 @@ how many fits converged. Nothing is chosen by this table.
 from __future__ import annotations
 
 import importlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -133,18 +133,36 @@ def print_table(rows: list[Line]) -> None:
         )
 
 
-def main() -> None:
-    """Fit what is missing, and print the table."""
-    parser = study_parser(__doc__, "razor-shwfs", 6)
+def fit_realisations(
+    description: str | None, realisations: int, name: str, fit: Callable[[str, int, int], Line]
+) -> list[Line]:
+    """The lines of the realisations that the command line asks for.
+
+    Parameters
+    ----------
+    description
+        Text of ``--help``.
+    realisations
+        How many, unless the command line says.
+    name
+        Name of the raw table behind that of the system.
+    fit
+        Returns the line of a system, the number of a realisation, and frames.
+    """
+    parser = study_parser(description, "razor-shwfs", realisations)
     parser.add_argument("--frames", type=int, default=1000)
     options = parser.parse_args()
-    rows = each_realisation(
-        options.out / f"{options.system}-constants.jsonl",
+    return each_realisation(
+        options.out / f"{options.system}{name}.jsonl",
         {"system": options.system, "frames": options.frames},
         realisation_numbers(options),
-        lambda number: run_realisation(options.system, number, options.frames),
+        lambda number: fit(options.system, number, options.frames),
     )
-    print_table(rows)
+
+
+def main() -> None:
+    """Fit what is missing, and print the table."""
+    print_table(fit_realisations(__doc__, 6, "-constants", run_realisation))
 
 
 if __name__ == "__main__":

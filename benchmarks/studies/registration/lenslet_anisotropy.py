@@ -15,10 +15,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from constants import with_key
+from constants import fit_realisations, with_key
 from numpy.typing import NDArray
 
-from escape_benchmarks.realisation_tables import Line, each_realisation, realisation_numbers, study_parser
+from escape_benchmarks.realisation_tables import Line
 from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.procedure import run as run_procedure
 from escape_hw.calibration.docrime.open_loop import docrime_run
@@ -105,16 +105,7 @@ def print_table(rows: list[Line]) -> None:
 
 def main() -> None:
     """Fit what is missing, and print the table."""
-    parser = study_parser(__doc__, "razor-shwfs", 8)
-    parser.add_argument("--frames", type=int, default=1000)
-    options = parser.parse_args()
-    rows = each_realisation(
-        options.out / f"{options.system}.jsonl",
-        {"system": options.system, "frames": options.frames},
-        realisation_numbers(options),
-        lambda number: run_realisation(options.system, number, options.frames),
-    )
-    print_table(rows)
+    print_table(fit_realisations(__doc__, 8, "", run_realisation))
 
 
 if __name__ == "__main__":

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from escape_hw.api.forwarding import Forwarding
 from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.registration import Registration
 from escape_hw.api.synthetic_model import SyntheticModel
@@ -23,6 +22,7 @@ from escape_hw.calibration.modes.derivatives import (
     zonal_jacobian,
     zonal_sum,
 )
+from escape_hw.calibration.sprint.forwarding import Forwarding
 
 #: Mean slope of a column relative to its rms below which its tip and tilt count as removed: rounding in
 #: single precision leaves 1e-6, a measured column about its noise over the root of the number of slopes.
