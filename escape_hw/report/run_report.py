@@ -174,7 +174,7 @@ def _residual_map(run: RunContent, number: int, label: str, estimate: Registrati
     caption = (
         f"Residual of the fit{f' ({label})' if label else ''}: rms over all modes and both slopes of every "
         "sub-aperture (left), and over all slopes of every actuator (right), in standard errors. Noise alone "
-        "is 1. Red border: more than three times the median."
+        "is 1. Red border: more than three times the median. Grey: not poked."
     )
     return html.figure(f"residual-map{number}", drawing, caption)
 

@@ -6,6 +6,7 @@ import dataclasses
 import json
 import math
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 
 import fake_results as fake
@@ -125,6 +126,19 @@ def test_residual_map_marks_the_outliers(layout):
         assert np.flatnonzero(mirror.collections[0].get_linewidths()).tolist() == [23]
     else:
         assert mirror.get_xlabel() == "actuator"
+
+
+def test_an_actuator_that_was_not_poked_is_not_drawn_as_a_good_fit():
+    lenslets = fake.grid(8)
+    found = fake.goodness_of_fit(lenslets.n_valid)
+    by_actuator = np.array(found.by_actuator)
+    by_actuator[5] = 0.0
+    figure = figures_residual.residual_map(
+        replace(found, by_actuator=by_actuator), lenslets.valid, fake.layout()
+    )
+    colours = figure.axes[1].collections[0].get_facecolor()
+    assert colours[5][3] < 0.5
+    assert (np.delete(colours, 5, axis=0)[:, 3] == 1).all()
 
 
 def test_page_is_sound_and_self_contained(page):

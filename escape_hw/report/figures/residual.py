@@ -77,7 +77,9 @@ def _draw_map(
     width = np.zeros(rms.size)
     width[find_outliers(rms)] = 1.6
     spots = PatchCollection([Circle((x, y), radius) for x, y in places], linewidths=width)
-    spots.set_facecolor([tuple(c) for c in style.map_colours(rms, _MAP, 0.0, limit)])
+    # An actuator out of service has no residual, which is not a good fit.
+    judged = np.where(rms > 0, rms, np.nan)
+    spots.set_facecolor([tuple(c) for c in style.map_colours(judged, _MAP, 0.0, limit)])
     spots.set_edgecolor(style.SERIES[5])
     style.hide_axes(axes).add_collection(spots)
     low, high = places.min(axis=0) - 1.2 * radius, places.max(axis=0) + 1.2 * radius
