@@ -34,6 +34,19 @@ def pitch_on_pupil(config: SystemConfig) -> float:
     return config.system.pupil_m / config.devices.dm.pitches_across_pupil
 
 
+#: Square beyond which a Gaussian, 1e-12 there, is zero.
+_NEGLIGIBLE_BEYOND = 55.0
+
+
+def gaussian(square: NDArray[np.float64]) -> NDArray[np.float64]:
+    """``exp(-square / 2)``, exactly zero far out.
+
+    Subnormal numbers, of which products of two such factors would be full in single precision, make matrix
+    products up to sixty times slower on some processors.
+    """
+    return np.where(square < _NEGLIGIBLE_BEYOND, np.exp(-0.5 * square), 0.0)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class InfluenceFunctions:
     """Influence functions with a radial profile that is a sum of Gaussians.
@@ -118,7 +131,7 @@ class InfluenceFunctions:
         x, y = [], []
         for share, scale in self.profile:
             u, v = dx / scale, dy / scale
-            gauss_x, gauss_y = np.exp(-0.5 * q[0, 0] * u**2), share * gain * np.exp(-0.5 * q[1, 1] * v**2)
+            gauss_x, gauss_y = gaussian(q[0, 0] * u**2), share * gain * gaussian(q[1, 1] * v**2)
             for power, weight in enumerate(_cross_term_weights(q)):
                 x.append(gauss_x * u**power if power else gauss_x)
                 y.append(gauss_y * (weight * v**power) if power else gauss_y)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from escape_hw.api.registration import Registration
-from escape_sim.mirror.influence_functions import InfluenceFunctions
+from escape_sim.mirror.influence_functions import InfluenceFunctions, gaussian
 
 #: Derivatives by the five parameters of the registration, in their order, and by the width.
 N_DERIVATIVES = 6
@@ -88,7 +88,7 @@ def gaussian_factors(
         (y_m, at[:, 1], sigma * stretch[1]),
     ):
         u = (coordinates[:, None] - position) / s
-        gauss = np.exp(-0.5 * np.square(u))
+        gauss = gaussian(np.square(u))
         kinds = [gauss, gauss * u / s, gauss * np.square(u)] if derivatives else [gauss]
         factors_xy.append(np.stack(kinds))
     factors_xy[1] *= float(influence.gain) * shares
