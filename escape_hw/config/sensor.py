@@ -51,12 +51,6 @@ class ShackHartmannSection(SensorSection):
         description="SPRINT: relative uncertainty of the spots' motion; blur within the lenslets counts as "
         "motion, too",
     )  # fmt: skip
-    anisotropy_sigma: float = Field(
-        0.02, gt=0, le=0.2,
-        description="SPRINT: relative change of the widths of influence functions along a slope, and the "
-        "opposite one across it, as the lenslets see them; 0.002 on twins with turbulence, and determined by "
-        "the data",
-    )  # fmt: skip
     valid: LayoutText | None = Field(
         None,
         description="valid sub-apertures on the grid of n_sub x n_sub: 'circle-N', 'square-N', "

@@ -14,7 +14,7 @@ from escape_hw.runtime.session.system import System
 
 #: Scripts that only print, if their raw table has all realisations.
 SCRIPTS = (
-    "capture_range", "constants", "lenslet_anisotropy", "lenslet_pokes", "nuisances", "registration_errors",
+    "capture_range", "constants", "lenslet_pokes", "neighbouring_spots", "nuisances", "registration_errors",
 )  # fmt: skip
 COMMAND = re.compile(
     rf"^python (benchmarks/studies/registration/(?:{'|'.join(SCRIPTS)})\.py .*--out docs/.*)$", re.MULTILINE

@@ -36,7 +36,7 @@ FACTORS = (0.5, 2.0)
 #: common width then being estimated from the data, and uncertainties of the sensor.
 PRIORS = ("actuator_gain", "actuator_width", "actuator_position", "slope_gain", "sampling", "width")
 SENSOR_KEYS = {
-    "shack-hartmann": ("motion_sigma", "anisotropy_sigma"),
+    "shack-hartmann": ("motion_sigma",),
     "pyramid": ("turbulence_sigma", "ellipticity_sigma", "image_position_sigma_px", "gain_trend"),
 }
 _SHAPE = "escape_hw.calibration.sprint.influence_shape"

@@ -6,7 +6,6 @@ mirror surfaces.
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
@@ -64,7 +63,9 @@ def slope_weights(
     of ``grid.motion_px`` rms along each axis; otherwise it would depend on the position of each lenslet
     relative to the pixels. It is also averaged over the turbulence within a lenslet
     (:func:`lenslet_turbulence`), which lifts the wings of the spots above the threshold; without it
-    scalings would be underestimated.
+    scalings would be underestimated. The lenslets around a window move on their own: if they moved alike,
+    the threshold would cut the sum of two wings in step, and scalings would again be underestimated, by
+    0.04 % of the diameter (docs/studies/neighbouring-spots.md).
 
     With ``wavefronts_m``, optical paths ``(n, n)`` in metres over the pupil, the derivative is averaged over
     these as well: each is added to a spot motion. Pokes of a mirror with about one actuator per lenslet are
@@ -84,10 +85,12 @@ def slope_weights(
     if is_mean and grid.turbulence_px:
         blur = np.sqrt(_turbulence_strength(config, grid)) * lenslet_turbulence(pupil.n_pix)
     out = {step: np.zeros((2, grid.n_valid, pupil.n_pix, pupil.n_pix)) for step in NEIGHBOURS}
+    phasors = [window_images.moved(*one) for one in zip(shifts, blur, strict=True)]
+    by_step = nodes_by_step(len(shifts))
     nodes = max(len(shifts), len(wavefronts_m))
     for node in range(nodes):
-        moved = window_images.moved(shifts[node % len(shifts)], blur[node % len(shifts)])
-        exposure = [(1.0, 1.0, dict.fromkeys(NEIGHBOURS, moved))]
+        moved = {step: phasors[of_step[node % len(shifts)]] for step, of_step in by_step.items()}
+        exposure = [(1.0, 1.0, moved)]
         if len(wavefronts_m):
             wavefront = wavefronts_m[node % len(wavefronts_m)]
             # The wavefront one lattice earlier is independent, and as symmetric as this one.
@@ -123,17 +126,17 @@ def _neighbour_phasors(
     grid: SubApertureGrid,
     pupil: PupilGeometry,
     phase: NDArray[np.floating],
-    moved: NDArray[np.complexfloating],
+    moved: Mapping[tuple[int, int], NDArray[np.complexfloating]],
 ) -> dict[tuple[int, int], NDArray[np.complexfloating]]:
     """Phasors ``(n_valid, p, p)`` of a phase over the pupil on the lenslets at each step from a window.
 
-    Multiplied by the phasors ``moved``, the same on all lenslets around a window.
+    Multiplied by the phasors ``moved`` of the same lenslets.
     """
     n, p = pupil.n_sub, pupil.n_pix
     rows, columns = np.nonzero(grid.valid)
     phasor = np.exp(1j * phase.reshape(n, p, n, p).transpose(0, 2, 1, 3)).astype(np.complex64)
     return {
-        (i, j): moved * phasor[np.clip(rows + i, 0, n - 1), np.clip(columns + j, 0, n - 1)]
+        (i, j): moved[i, j] * phasor[np.clip(rows + i, 0, n - 1), np.clip(columns + j, 0, n - 1)]
         for i, j in NEIGHBOURS
     }
 
@@ -150,6 +153,21 @@ def gaussian_lattice() -> NDArray[np.float64]:
     paired = (i * _LATTICE_STEP + (_LATTICE_STEP - 1) // 2) % _N_NODES
     nodes = ndtri((np.stack([i, paired], axis=1) + 0.5) / _N_NODES)
     return np.asarray(nodes / nodes.std(axis=0))
+
+
+def nodes_by_step(n_nodes: int) -> dict[tuple[int, int], NDArray[np.intp]]:
+    """Nodes of :func:`gaussian_lattice` of the lenslet at each step, for all nodes of the window's own.
+
+    Other lenslets have the nodes in an order of their own. Of opposite lenslets it is the same seen from the
+    other side: a chance correlation with one of them alone would be taken for a shift. The true correlation
+    of adjacent tilts, 0.5 to 0.8 in turbulence, gives the same response as none.
+    """
+    rng, own = np.random.default_rng(11), np.arange(n_nodes)
+    out = {(0, 0): own}
+    for i, j in NEIGHBOURS[: len(NEIGHBOURS) // 2]:
+        order = rng.permutation(n_nodes)
+        out[i, j], out[-i, -j] = order, (n_nodes - 1 - order)[::-1]
+    return out
 
 
 def lenslet_turbulence(samples: int) -> NDArray[np.float64]:
@@ -503,7 +521,6 @@ class ShackHartmannModel(DesignModel):
         self._variants: list[ShackHartmannModel] | None = None
         self._wavefronts_m, self._overlap = tuple(wavefronts_m), overlap
         self._around_pokes: tuple[Registration, ShackHartmannModel] | None = None
-        self._anisotropy = 0.0
 
     @cached_property
     def _slopes(self) -> SlopeOperator:
@@ -525,26 +542,6 @@ class ShackHartmannModel(DesignModel):
 
     def zonal_matrix(self, registration: Registration, width: float = 1.0) -> NDArray[np.float64]:
         """Slopes in pixels per unit command ``(n_slopes, n_act)``, see :class:`SyntheticModel`."""
-        matrix = self._isotropic_matrix(registration, width)
-        return matrix + self._anisotropic_part(registration, width) if self._anisotropy else matrix
-
-    def _anisotropic_part(self, registration: Registration, width: float) -> NDArray[np.float64]:
-        """Change of the matrix where functions are wider along each slope, and narrower across it.
-
-        That of Gaussians for mirrors of any other shape and for anamorphosis in any direction.
-        """
-        model = self if isinstance(self._nominal, InfluenceFunctions) else self.component_model()
-        upright = replace(registration, anamorphosis_angle=0.0)
-        factors = model._factors(  # noqa: SLF001
-            self._slopes.nodes_m, upright, width, derivatives=True
-        )
-        parts = factors.sum_terms(self._slopes.zonal(factors, derivatives=True))
-        half = self._grid.n_valid
-        change = (parts[3] - parts[4]).astype(float)
-        change[half:] *= -1
-        return np.asarray(change * (self._anisotropy * self._opd_per_command_m))
-
-    def _isotropic_matrix(self, registration: Registration, width: float) -> NDArray[np.float64]:
         if not self._is_separable(registration):
             surfaces = np.moveaxis(self._surfaces(self._slopes.nodes_m, registration, width), 0, 2).copy()
             return np.asarray(self._slopes.slopes(surfaces) * self._opd_per_command_m)
@@ -639,23 +636,13 @@ class ShackHartmannModel(DesignModel):
         return self._grid.numbering_offsets
 
     def variants(self) -> list[ShackHartmannModel]:
-        """Models of a sensor that differs, see :class:`SyntheticModel`.
-
-        One has motion and pokes larger by the motion's uncertainty. To the other, x slopes see influence
-        functions wider along x and narrower along y, and y slopes the other way round. Turbulence does this
-        by 0.2 %, which the scalings along x and y would otherwise take up with opposite signs.
-        """
+        """The model with motion and pokes larger by the motion's uncertainty, see :class:`SyntheticModel`."""
         if self._variants is None:
-            sensor = self._config.sensor_as(ShackHartmannSection)
-            self._variants = []
-            if self._grid.motion_px or self._wavefronts_m:
-                larger = 1 + sensor.motion_sigma
-                grid = replace(self._grid, motion_px=self._grid.motion_px * larger)
-                wavefronts = [larger * one for one in self._wavefronts_m]
-                self._variants.append(ShackHartmannModel(self._config, grid, wavefronts, self._overlap))
-            anisotropic = copy.copy(self)
-            anisotropic._anisotropy = sensor.anisotropy_sigma  # noqa: SLF001
-            self._variants.append(anisotropic)
+            larger = 1 + self._config.sensor_as(ShackHartmannSection).motion_sigma
+            grid = replace(self._grid, motion_px=self._grid.motion_px * larger)
+            wavefronts = [larger * one for one in self._wavefronts_m]
+            varied = ShackHartmannModel(self._config, grid, wavefronts, self._overlap)
+            self._variants = [varied] if grid.motion_px or wavefronts else []
         return list(self._variants)
 
     def around_pokes(
