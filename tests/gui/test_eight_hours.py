@@ -11,13 +11,13 @@ from pathlib import Path
 import pytest
 
 HERE = Path(__file__).parent
-#: Limit of the process, and of its growth, MB.
-LIMIT_MB, GROWTH_MB = 300, 80
+#: Limit of the process, of which the libraries take 210 to 255 MB by their version, and of its growth; MB.
+LIMIT_MB, GROWTH_MB = 350, 80
 
 
 @pytest.mark.campaign
 @pytest.mark.timeout(1800)
-def test_eight_hours_of_history_need_less_than_300_mb(tmp_path: Path) -> None:
+def test_eight_hours_of_history_need_less_than_80_mb(tmp_path: Path) -> None:
     environment = {
         **os.environ, "QT_QPA_PLATFORM": "offscreen", "OPENBLAS_NUM_THREADS": "1",
         "PYTHONPATH": os.pathsep.join([str(HERE), str(HERE.parent), *sys.path]),
