@@ -24,8 +24,8 @@ from escape_benchmarks.realisation_tables import Line, each_realisation, read_li
 from escape_hw.api.registration import PARAMETERS
 from escape_hw.report.figures.style import SERIES, new_figure, style_axes
 
-#: Realisations of all cases. No constant and no method was chosen on them.
-REALISATIONS = range(7000, 7020)
+#: Realisations of a case. No constant and no method was chosen on them.
+N_REALISATIONS = 20
 #: The mirror of the bundled benches until version 0.2.0.
 GAUSSIAN = (
     "devices.dm.influence=gaussian", "devices.dm.coupling=0.4", "twin.mirror.shape=gaussian",
@@ -39,13 +39,22 @@ _THIN_PLATE = (
 
 @dataclass(frozen=True)
 class Case:
-    """A system with a mirror and a number of frames; ``title`` is its heading."""
+    """A system with a mirror and a number of frames.
+
+    ``title`` is its heading, and ``first`` its first realisation.
+    """
 
     title: str
     system: str
     frames: int
     overrides: tuple[str, ...] = ()
     dm97: bool = False
+    first: int = 7000
+
+    @property
+    def realisations(self) -> range:
+        """Numbers of the realisations."""
+        return range(self.first, self.first + N_REALISATIONS)
 
 
 CASES = {
@@ -54,18 +63,18 @@ CASES = {
     "gaussian-1000": Case("Gaussian influence functions, 1,000 frames", "razor-shwfs", 1000, GAUSSIAN),
     "gaussian-50": Case("Gaussian influence functions, 50 frames", "razor-shwfs", 50, GAUSSIAN),
     "thin-plate-1000": Case("thin plates, 1,000 frames", "razor-shwfs", 1000, _THIN_PLATE),
-    "dm97-1500": Case("mirrors like a DM97, 1,500 frames", "razor-pywfs", 1500, dm97=True),
+    "dm97-1500": Case("mirrors like a DM97, 1,500 frames", "razor-pywfs", 1500, dm97=True, first=3000),
     "revolt-2000": Case("as bundled, 2,000 frames", "revolt-shwfs", 2000),
-    "nir-1500": Case("as bundled, 1,500 frames", "maps-nir", 1500),
+    "nir-1500": Case("as bundled, 1,500 frames", "maps-nir", 1500, first=3000),
     "nir-clean-1500": Case(
         "clean and evenly lit, 1,500 frames", "maps-nir", 1500,
-        tuple(contamination_overrides(0.0)),
+        tuple(contamination_overrides(0.0)), first=3000,
     ),
     "nir-tenth-1500": Case(
         "a tenth of the pupil contaminated, 1,500 frames", "maps-nir", 1500,
-        tuple(contamination_overrides(0.28)),
+        tuple(contamination_overrides(0.28)), first=3000,
     ),
-    "vis-1500": Case("as bundled, 1,500 frames", "maps-vis", 1500),
+    "vis-1500": Case("as bundled, 1,500 frames", "maps-vis", 1500, first=3000),
 }  # fmt: skip
 
 #: Limits of the rms errors that the page claims: shift, rotation, scaling; and of what a matrix leaves, in %.
@@ -86,7 +95,7 @@ def measure(folder: Path, name: str) -> None:
     each_realisation(
         table_path(folder, name),
         {"system": case.system, "frames": case.frames, "set": list(case.overrides), "dm97": case.dm97},
-        REALISATIONS,
+        case.realisations,
         lambda number: run_realisation(case.system, number, case.frames, list(case.overrides), case.dm97),
         lambda row: f"{name} {np.round(row['error'], 3).tolist()}",
     )
