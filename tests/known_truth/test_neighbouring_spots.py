@@ -1,4 +1,4 @@
-"""Spots around a window move on their own, which a model must contain for the scalings to be right."""
+"""Independent motion of neighbouring spots in the model, without which shifts and scalings are biased."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ EXACT = [
 ]  # fmt: skip
 
 
-def test_every_lenslet_has_all_nodes_in_an_order_of_its_own():
+def test_each_neighbour_has_a_permutation_of_the_nodes():
     nodes = shack_hartmann.nodes_by_step(34)
     assert nodes[0, 0].tolist() == list(range(34))
     assert all(sorted(order.tolist()) == list(range(34)) for order in nodes.values())
-    # Seen from the other side, opposite lenslets move alike: no side is preferred.
+    # Point reflections of each other: no side is preferred.
     assert all((order + nodes[-i, -j][::-1] == 33).all() for (i, j), order in nodes.items())
     assert len({tuple(order) for order in nodes.values()}) == len(shack_hartmann.NEIGHBOURS)
 
@@ -61,8 +61,8 @@ def test_registration_has_no_bias(monkeypatch):
     assert np.abs(errors[:2]).max() < 0.1
     assert np.abs(errors[3:]).max() < 0.015
 
-    def alike(n_nodes):
+    def same_motion(n_nodes):
         return dict.fromkeys(shack_hartmann.NEIGHBOURS, np.arange(n_nodes))
 
-    monkeypatch.setattr(shack_hartmann, "nodes_by_step", alike)
+    monkeypatch.setattr(shack_hartmann, "nodes_by_step", same_motion)
     assert (registration_errors(config, run.result.grid, matrix, injected)[3:] < -0.025).all()

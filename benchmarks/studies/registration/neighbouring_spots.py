@@ -1,20 +1,19 @@
-"""Do neighbouring spots move alike? What the answer does to the scalings of a registration.
+"""Bias of the scalings of a registration by the model's motion of neighbouring spots.
 
     python benchmarks/studies/registration/neighbouring_spots.py --out docs/studies/neighbouring-spots
 
 Each realisation, as in ``registration_errors.py``, has a mirror of Gaussian influence functions, with which
 scalings are known best, and is measured with DO-CRIME under turbulence. SPRINT fits the matrix with the model
-as it is, whose lenslets move on their own, and with one whose lenslets all move alike; each also without the
-x slopes and without the y slopes. Writes ``SYSTEM.jsonl``, a line per realisation. Prints the mean errors of
-the scalings in % of the diameter with the standard error of that mean, and mean squared errors over squared
-standard errors. A realisation takes half a minute of a core.
+as it is, in which the spots of neighbouring lenslets move independently, and with one in which they have the
+same motion; both also without the x slopes and without the y slopes. Writes ``SYSTEM.jsonl``, a line per
+realisation. Prints the mean errors of the scalings in % of the diameter with the standard error of that mean,
+and mean squared errors over squared standard errors. A realisation takes half a minute of a core.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import replace
+from unittest import mock
 
 import numpy as np
 from constants import fit_realisations
@@ -35,23 +34,11 @@ from escape_sim.models import shack_hartmann
 
 #: Factor of the standard errors of slopes that are left out.
 LEFT_OUT = 30.0
-Nodes = Callable[[int], dict[tuple[int, int], NDArray[np.intp]]]
 
 
-def move_alike(n_nodes: int) -> dict[tuple[int, int], NDArray[np.intp]]:
+def same_motion(n_nodes: int) -> dict[tuple[int, int], NDArray[np.intp]]:
     """Nodes of the spot motion, the same for all lenslets around a window."""
     return dict.fromkeys(shack_hartmann.NEIGHBOURS, np.arange(n_nodes))
-
-
-@contextmanager
-def spots_that(move: Nodes) -> Iterator[None]:
-    """Models with another motion of neighbouring spots, for the time being."""
-    own = shack_hartmann.nodes_by_step
-    shack_hartmann.nodes_by_step = move
-    try:
-        yield
-    finally:
-        shack_hartmann.nodes_by_step = own
 
 
 def without_slopes(matrix: InteractionMatrix, axis: int) -> InteractionMatrix:
@@ -67,11 +54,11 @@ def run_realisation(system: str, number: int, frames: int) -> Line:
         run = bench.run(docrime_run(bench, frames=frames))
     matrix = decorrelate_columns(run.result.matrix, run.solution.gram, run.solution.variance)
     line: Line = {"commit": get_git_state(), "seed": config.system.seed, "fits": {}}
-    for motion, nodes in (("on their own", shack_hartmann.nodes_by_step), ("alike", move_alike)):
+    for motion, nodes in (("independent", shack_hartmann.nodes_by_step), ("the same", same_motion)):
         for slopes, measured in (
             ("all", matrix), ("y", without_slopes(matrix, 0)), ("x", without_slopes(matrix, 1)),
         ):  # fmt: skip
-            with spots_that(nodes):
+            with mock.patch.object(shack_hartmann, "nodes_by_step", nodes):
                 model = model_factory(config.calibration.model)(config, run.result.grid)
                 found = run_procedure(
                     fit_registration(
@@ -88,7 +75,7 @@ def run_realisation(system: str, number: int, frames: int) -> Line:
 
 def print_table(rows: list[Line]) -> None:
     """Markdown table of the errors of both scalings by motion and slopes."""
-    print("| lenslets move | slopes | radial [%] | tangential [%] | chi-squared |")
+    print("| motion of neighbouring spots | slopes | radial [%] | tangential [%] | chi-squared |")
     print("|---|---|---:|---:|---:|")
     for label in rows[0]["fits"]:
         errors, sigmas = (

@@ -63,9 +63,9 @@ def slope_weights(
     of ``grid.motion_px`` rms along each axis; otherwise it would depend on the position of each lenslet
     relative to the pixels. It is also averaged over the turbulence within a lenslet
     (:func:`lenslet_turbulence`), which lifts the wings of the spots above the threshold; without it
-    scalings would be underestimated. The lenslets around a window move on their own: if they moved alike,
-    the threshold would cut the sum of two wings in step, and scalings would again be underestimated, by
-    0.04 % of the diameter (docs/studies/neighbouring-spots.md).
+    scalings would be underestimated. Spots of neighbouring lenslets move independently: with the same
+    motion, the threshold would always cut the sum of two wings at the same place, and scalings would again be
+    underestimated (docs/studies/neighbouring-spots.md).
 
     With ``wavefronts_m``, optical paths ``(n, n)`` in metres over the pupil, the derivative is averaged over
     these as well: each is added to a spot motion. Pokes of a mirror with about one actuator per lenslet are
@@ -156,11 +156,11 @@ def gaussian_lattice() -> NDArray[np.float64]:
 
 
 def nodes_by_step(n_nodes: int) -> dict[tuple[int, int], NDArray[np.intp]]:
-    """Nodes of :func:`gaussian_lattice` of the lenslet at each step, for all nodes of the window's own.
+    """Nodes of :func:`gaussian_lattice` ``(n_nodes,)`` of the lenslet at each step, by those of the window's.
 
-    Other lenslets have the nodes in an order of their own. Of opposite lenslets it is the same seen from the
-    other side: a chance correlation with one of them alone would be taken for a shift. The true correlation
-    of adjacent tilts, 0.5 to 0.8 in turbulence, gives the same response as none.
+    Each neighbour has a random permutation, so that its motion is independent. The permutations of opposite
+    neighbours are point reflections of each other: a chance correlation with one alone would be a bias of the
+    shift. In turbulence adjacent tilts have correlations of 0.5 to 0.8; that hardly changes the response.
     """
     rng, own = np.random.default_rng(11), np.arange(n_nodes)
     out = {(0, 0): own}
