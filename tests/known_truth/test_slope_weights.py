@@ -65,12 +65,20 @@ class Truth:
             )
         return out.ravel()
 
+    @property
+    def px_per_metre(self):
+        return self.config.system.wavelength_m / self.pupil.sub_aperture_m / self.config.sensor.spot_px
+
+    def tilt(self, x_px, y_px):
+        """Path that moves all spots by so many pixels."""
+        x = self.pupil.coordinates_m * self.px_per_metre
+        return x_px * x[None, :] + y_px * x[:, None]
+
     def tilts(self, moves_px):
         """Path that moves the spot of each sub-aperture by its own number of pixels along x and y."""
         n, p = self.pupil.n_sub, self.pupil.n_pix
-        per_metre = self.config.system.wavelength_m / self.pupil.sub_aperture_m / self.config.sensor.spot_px
-        x = self.pupil.coordinates_m.reshape(n, p)
-        x = (x - x.mean(axis=1, keepdims=True)).ravel() * per_metre
+        x = self.pupil.coordinates_m.reshape(n, p) * self.px_per_metre
+        x = (x - x.mean(axis=1, keepdims=True)).ravel()
         along_x, along_y = np.kron(moves_px.reshape(2, n, n), np.ones((p, p)))
         return along_x * x + along_y * x[:, None]
 
