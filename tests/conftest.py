@@ -12,9 +12,10 @@ from study_scripts import import_study
 
 __all__ = ["import_study", "pytest_addoption", "pytest_configure", "pytest_terminal_summary"]
 
-# Shells start background jobs with Ctrl-C ignored, and Python keeps that.
-if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
-    signal.signal(signal.SIGINT, signal.default_int_handler)
+# Shells start background jobs with Ctrl-C ignored, nohup ignores hang-ups; commands under test inherit that.
+for _signal, _handler in ((signal.SIGINT, signal.default_int_handler), (signal.SIGHUP, signal.SIG_DFL)):
+    if signal.getsignal(_signal) is signal.SIG_IGN:
+        signal.signal(_signal, _handler)
 
 # How long an example takes says how busy the computer is, not whether the code is right.
 settings.register_profile("untimed", deadline=None, suppress_health_check=[HealthCheck.too_slow])

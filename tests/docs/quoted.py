@@ -6,6 +6,8 @@ import re
 
 _NUMBER = re.compile(r"[+−-]?\d+(?:\.\d+)?")
 _MEASURED = re.compile(rf"({_NUMBER.pattern})\s*±\s*({_NUMBER.pattern})")
+#: Rounding decides which step is the last.
+_ITERATIONS = re.compile(r"(\d+) iterations")
 
 
 def _words(line: str) -> str:
@@ -21,7 +23,8 @@ def differences(quoted: str, printed: str) -> list[str]:
     """Lines of a quotation that the output does not have, or has with other numbers.
 
     A value with an error may be half of that error off, a difference over its error a half, other numbers
-    two per cent or one of their last digit: what another processor's rounding may do, and no other estimator.
+    two per cent or one of their last digit, a number of iterations two: what another processor's rounding may
+    do, and no other estimator.
     """
     found: dict[str, list[str]] = {}
     for line in printed.splitlines():
@@ -35,6 +38,10 @@ def differences(quoted: str, printed: str) -> list[str]:
 
 
 def _agree(quoted: str, printed: str) -> bool:
+    steps = zip(*(map(int, _ITERATIONS.findall(line)) for line in (quoted, printed)), strict=True)
+    if any(abs(a - b) > 2 for a, b in steps):
+        return False
+    quoted, printed = (_ITERATIONS.sub("", line) for line in (quoted, printed))
     measured = zip(_MEASURED.findall(quoted), _MEASURED.findall(printed), strict=True)
     rest = zip(*(_NUMBER.findall(_MEASURED.sub("", line)) for line in (quoted, printed)), strict=True)
     return all(_same_measured(a, b) for a, b in measured) and all(_near(a, b) for a, b in rest)

@@ -62,6 +62,8 @@ def test_a_quotation_is_compared_with_the_output() -> None:
     printed = "delay: 2.16 frames\n Shift X [%]  −16.036 ± 0.050   −0.7   −16\n"
     assert differences("delay: 2.17 frames\n Shift X [%] −16.05 ± 0.051  −0.9  −16", printed) == []
     assert differences("rotation 0.0019 0.012", "rotation 0.0020 0.013") == []
+    assert differences("converged in 16 iterations", "converged in 15 iterations") == []
+    assert len(differences("converged in 16 iterations", "converged in 13 iterations")) == 1
     assert len(differences("rotation 0.0019 15", "rotation 0.0022 15")) == 1
     assert len(differences("rotation 0.0019 15", "rotation 0.0019 16")) == 1
     assert len(differences("delay: 3.16 frames\nlag: 2.16 frames", printed)) == 2
