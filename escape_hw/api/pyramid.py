@@ -68,6 +68,9 @@ class PyramidPupils(SensorGeometry):
         Number of independent realisations of the turbulence in the measurement; 0 if unknown.
     persistent_fraction
         Fraction of the slope variance that is correlated over two frames: turbulence, not pokes.
+    residual_tilt
+        Temporal rms per axis of the slopes' mean over the pupil in closed loop, where the modes have taken
+        most of the turbulence; 0 in open loop.
     """
 
     kind: ClassVar[str] = "pyramid"
@@ -93,6 +96,7 @@ class PyramidPupils(SensorGeometry):
     pokes: float = 0.0
     n_effective: float = 0.0
     persistent_fraction: float = 0.0
+    residual_tilt: float = 0.0
     __repr__ = short_repr
 
     def outlines(self) -> tuple[tuple[float, float, float], ...]:
@@ -100,12 +104,18 @@ class PyramidPupils(SensorGeometry):
         return tuple((float(x), float(y), self.diameter_px / 2) for x, y in self.centres_px)
 
     def with_slope_statistics(
-        self, rms: float, pokes: float = 0.0, n_effective: float = 0.0, persistent_fraction: float = 0.0
+        self,
+        rms: float,
+        pokes: float = 0.0,
+        n_effective: float = 0.0,
+        persistent_fraction: float = 0.0,
+        residual_tilt: float = 0.0,
     ) -> PyramidPupils:
         """See :meth:`SensorGeometry.with_slope_statistics`."""
         return replace(
-            self, motion=rms, pokes=pokes, n_effective=n_effective, persistent_fraction=persistent_fraction
-        )
+            self, motion=rms, pokes=pokes, n_effective=n_effective, persistent_fraction=persistent_fraction,
+            residual_tilt=residual_tilt,
+        )  # fmt: skip
 
     def with_mean_slopes(self, mean: NDArray[np.float64]) -> PyramidPupils:
         """See :meth:`SensorGeometry.with_mean_slopes`; only the part that is not smooth is added."""

@@ -76,7 +76,12 @@ class SensorGeometry(abc.ABC):
 
     @abc.abstractmethod
     def with_slope_statistics(
-        self, rms: float, pokes: float = 0.0, n_effective: float = 0.0, persistent_fraction: float = 0.0
+        self,
+        rms: float,
+        pokes: float = 0.0,
+        n_effective: float = 0.0,
+        persistent_fraction: float = 0.0,
+        residual_tilt: float = 0.0,
     ) -> Self:
         """The geometry with the slope statistics of a measurement.
 
@@ -90,6 +95,8 @@ class SensorGeometry(abc.ABC):
             Number of independent realisations of the turbulence; 0 if unknown.
         persistent_fraction
             Fraction of the slope variance that is correlated over two frames; 0 if unknown.
+        residual_tilt
+            In closed loop: temporal rms per axis of the slopes' mean over the pupil; 0 in open loop.
         """
 
     @abc.abstractmethod
@@ -210,7 +217,12 @@ class SubApertureGrid(SensorGeometry):
         return tuple((float(x), float(y), self.pitch_px / 2) for x, y in self.centres_px())
 
     def with_slope_statistics(
-        self, rms: float, pokes: float = 0.0, n_effective: float = 0.0, persistent_fraction: float = 0.0
+        self,
+        rms: float,
+        pokes: float = 0.0,
+        n_effective: float = 0.0,
+        persistent_fraction: float = 0.0,
+        residual_tilt: float = 0.0,
     ) -> SubApertureGrid:
         """See :meth:`SensorGeometry.with_slope_statistics`.
 

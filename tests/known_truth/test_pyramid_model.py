@@ -20,7 +20,7 @@ from escape_sim.mirror.mode_surfaces import surface_nodes
 from escape_sim.models.factory import make_fast_model
 from escape_sim.models.pyramid import PyramidModel, nominal_pupils
 from escape_sim.models.pyramid_response import slope_response
-from escape_sim.models.pyramid_turbulence import estimate_strength, sample_distances
+from escape_sim.models.pyramid_turbulence import estimate_strength, sample_distances, unit_screens
 from escape_sim.oopao import models as oopao_model
 from escape_sim.optics.modulation import ModulationPath
 from escape_sim.optics.pyramid import Prism, PyramidOptics, frequencies
@@ -271,7 +271,10 @@ def test_the_motion_of_the_slopes_gives_the_strength(ratio):
     paths = [p * WAVELENGTH / (2 * np.pi) for p in Screens(16, ratio)(100)]
     slopes = [slopes_of_image(optics.frame(p.astype(np.float32)), pupils) for p in paths]
     motion = float(np.sqrt(np.var(slopes, axis=0).mean()))
-    assert estimate_strength(optics, replace(pupils, motion=motion), 4.0) == pytest.approx(ratio, rel=0.25)
+    screens = unit_screens(optics.amplitude.shape[0], 4.0)
+    assert estimate_strength(optics, replace(pupils, motion=motion), screens) == pytest.approx(
+        ratio, rel=0.25
+    )
     assert PyramidModel(config, replace(pupils, motion=motion)).turbulence == pytest.approx(ratio, rel=0.25)
 
 
@@ -286,9 +289,10 @@ def test_motion_beyond_the_most_is_as_strong_as_the_most():
     config = configuration()
     pupils = nominal_pupils(config)
     optics = PyramidModel(config, pupils).optics()
-    most = estimate_strength(optics, replace(pupils, motion=10.0), 4.0)
+    screens = unit_screens(optics.amplitude.shape[0], 4.0)
+    most = estimate_strength(optics, replace(pupils, motion=10.0), screens)
     assert 7 < most < 40
-    assert estimate_strength(optics, replace(pupils, motion=20.0), 4.0) == most
+    assert estimate_strength(optics, replace(pupils, motion=20.0), screens) == most
 
 
 def test_variants_differ_in_turbulence_modulation_and_the_place_of_the_images(model):

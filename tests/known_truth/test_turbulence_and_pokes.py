@@ -117,7 +117,8 @@ def test_the_strength_is_estimated_with_pokes(pupils: PyramidPupils, ratio: floa
     model = poked(pupils, 0.05)
     optics, pokes = model.optics(), random_pokes(model)
     # Other phases than those that the estimate compares with.
-    turbulence = np.array([screen.T[::-1] for screen in unit_screens(optics.amplitude.shape[0], 4.0)])
+    screens = unit_screens(optics.amplitude.shape[0], 4.0)
+    turbulence = np.array([screen.T[::-1] for screen in screens])
     turbulence = np.tile(turbulence * ratio ** (5 / 6), (4, 1, 1))
 
     def slopes(rng: np.random.Generator) -> NDArray[np.float64]:
@@ -135,7 +136,7 @@ def test_the_strength_is_estimated_with_pokes(pupils: PyramidPupils, ratio: floa
         first, second = slopes(rng), slopes(rng)
         rms = float(np.sqrt(np.mean(np.square([first, second]))))
         seen = replace(pupils, motion=rms, persistent_fraction=float(np.mean(first * second) / rms**2))
-        found.append(estimate_strength(optics, seen, 4.0, pokes))
+        found.append(estimate_strength(optics, seen, screens, pokes))
     assert np.mean(found) == pytest.approx(ratio, rel=0.3)
 
 

@@ -10,7 +10,7 @@ import pytest
 from escape_hw.calibration.docrime import estimator_thread as background
 from escape_hw.calibration.docrime.estimator_thread import EstimatorThread
 
-N_SLOPES, N_MODES = 3, 2
+N_SLOPES, N_MODES = 4, 2
 
 
 class Recorder:
@@ -43,7 +43,7 @@ def test_every_frame_arrives_once_and_in_order(frames):
         feed(beside, frames)
         assert beside.finish() is recorder
     assert recorder.index == list(range(frames))
-    assert recorder.rows == [[k] * 3 + [k + 0.25] * 2 + [k + 0.5] * 2 for k in range(frames)]
+    assert recorder.rows == [[k] * N_SLOPES + [k + 0.25] * 2 + [k + 0.5] * 2 for k in range(frames)]
     if frames > 1:
         slope_statistics = beside.slope_statistics.state()
         assert slope_statistics[0] == pytest.approx(np.sum(np.arange(frames)))

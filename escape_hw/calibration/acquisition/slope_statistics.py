@@ -34,7 +34,7 @@ class SlopeStatistics:
         self._n_frames = 0
         self._sum = np.zeros(n_slopes)
         self._sum_of_squares = np.zeros(n_slopes)
-        self._poke_power = self._lag_products = 0.0
+        self._poke_power = self._lag_products = self._tilt_power = 0.0
         self._n_lag_pairs = 0
         self._recent_slopes: deque[NDArray[np.float32]] = deque(maxlen=_LAG_FRAMES)
         self._blocks, self._block_length = [np.zeros(n_slopes)], 1
@@ -54,6 +54,7 @@ class SlopeStatistics:
         self._n_frames += 1
         self._sum += slopes
         self._sum_of_squares += np.square(slopes, dtype=np.float64)
+        self._tilt_power += float(np.square(slopes.reshape(2, -1).mean(axis=1, dtype=np.float64)).mean())
         if poke is not None:
             self._poke_power += float(poke @ poke)
 
@@ -62,15 +63,18 @@ class SlopeStatistics:
         self._n_frames += len(slopes)
         self._sum += slopes.sum(axis=0, dtype=np.float64)
         self._sum_of_squares += np.einsum("ts,ts->s", slopes, slopes, dtype=np.float64)
+        tilts = slopes.reshape(len(slopes), 2, -1).mean(axis=2, dtype=np.float64)
+        self._tilt_power += float(np.square(tilts).mean(axis=1).sum())
 
     def state(self) -> NDArray[np.float64]:
-        """All sums and counts ``(7 + blocks, n_slopes)``, for :meth:`restore`."""
+        """All sums and counts ``(8 + blocks, n_slopes)``, for :meth:`restore`."""
         numbers = (
             float(self._n_frames),
             self._poke_power,
             self._lag_products,
             float(self._n_lag_pairs),
             float(self._block_length),
+            self._tilt_power,
         )
         rows = (np.full(self.n_slopes, number) for number in numbers)
         return np.stack([self._sum, self._sum_of_squares, *rows, *self._blocks])
@@ -80,13 +84,15 @@ class SlopeStatistics:
         self._sum, self._sum_of_squares, self._n_frames = state[0].copy(), state[1].copy(), int(state[2, 0])
         self._poke_power, self._lag_products = float(state[3, 0]), float(state[4, 0])
         self._n_lag_pairs, self._block_length = int(state[5, 0]), int(state[6, 0])
-        self._blocks = [row.copy() for row in state[7:]]
+        self._tilt_power = float(state[7, 0])
+        self._blocks = [row.copy() for row in state[8:]]
         self._recent_slopes.clear()
 
     def annotate_geometry(self, grid: SensorGeometry, *, closed: bool = False) -> SensorGeometry:
         """Return the geometry with rms of slopes and pokes, number of independent samples and persistence.
 
-        In closed loop (``closed``) the persistent part of the slopes is not attributed to turbulence.
+        In closed loop (``closed``) the persistent part of the slopes is not attributed to turbulence, and the
+        rms of the tilt is given instead.
         """
         if self._n_frames < 2:
             return grid
@@ -96,8 +102,9 @@ class SlopeStatistics:
         persistent_fraction = self._persistence(variance)
         n_effective = self._effective_samples(variance, persistent_fraction if poke_rms else 1.0)
         return grid.with_slope_statistics(
-            float(np.sqrt(variance)), poke_rms, n_effective, 0.0 if closed else persistent_fraction
-        )
+            float(np.sqrt(variance)), poke_rms, n_effective, 0.0 if closed else persistent_fraction,
+            self._tilt_rms() if closed else 0.0,
+        )  # fmt: skip
 
     def update_references(
         self, grid: SensorGeometry, focus_estimator: StaticFocusEstimator | None = None
@@ -110,6 +117,11 @@ class SlopeStatistics:
             return grid
         mean = self._sum / self._n_frames
         return grid.with_mean_slopes(mean if focus_estimator is None else focus_estimator.correct_mean(mean))
+
+    def _tilt_rms(self) -> float:
+        """Rms per axis of the slopes' mean over the pupil, about its mean over time."""
+        mean = np.square(self._sum.reshape(2, -1).mean(axis=1) / self._n_frames).mean()
+        return float(np.sqrt(max(self._tilt_power / self._n_frames - mean, 0.0)))
 
     def _persistence(self, variance: float) -> float:
         """Correlation of the slopes at a lag of :data:`_LAG_FRAMES`, between 0 and 1."""

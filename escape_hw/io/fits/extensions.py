@@ -39,7 +39,7 @@ _CARDS: dict[str, dict[str, str]] = {
     PyramidPupils.kind: {
         "DIAMETER": "diameter_px", "MOTION": "motion", "CENTRESD": "centre_sigma_px", "POKES": "pokes",
         "LOOKS": "n_effective", "STEADY": "persistent_fraction", "NORMAL": "normalisation",
-        "MODULAT": "modulation", **_COMMON_CARDS,
+        "MODULAT": "modulation", "TILTRMS": "residual_tilt", **_COMMON_CARDS,
     },
 }  # fmt: skip
 

@@ -14,7 +14,6 @@ from escape_hw.api.pyramid import PyramidPupils, pupil_boxes
 from escape_hw.api.registration import Registration
 from escape_hw.calibration.modes.bases import build_basis
 from escape_hw.config.sensor import PyramidSection
-from escape_sim.atmosphere.von_karman import structure_function
 from escape_sim.mirror.influence_functions import SINGLE_GAUSSIAN, InfluenceFunctions
 from escape_sim.mirror.mode_surfaces import (
     N_DERIVATIVES,
@@ -27,10 +26,10 @@ from escape_sim.models.base import DesignModel
 from escape_sim.models.pyramid_response import slope_response
 from escape_sim.models.pyramid_turbulence import (
     PokePhase,
+    Turbulence,
     estimate_strength,
     sample_distances,
     turbulence_registration_scatter,
-    unit_screens,
 )
 from escape_sim.optics.fourier_filter import next_fast_length
 from escape_sim.optics.modulation import ModulationPath
@@ -104,6 +103,8 @@ class PyramidModel(DesignModel):
         Pupil diameters over r0 to average over; by default estimated from the motion of the slopes.
     basis
         Modes ``(n_act, n_modes)`` that were poked; by default those of the configuration.
+    phases
+        The turbulence over the pupil; by default as measured.
 
     Raises
     ------
@@ -121,6 +122,7 @@ class PyramidModel(DesignModel):
         modulation: ModulationPath | None = None,
         turbulence: float | None = None,
         basis: NDArray[np.float64] | None = None,
+        phases: Turbulence | None = None,
     ) -> None:
         pupil = pupil_from_images(config, pupils)
         super().__init__(config, pupil)
@@ -129,9 +131,12 @@ class PyramidModel(DesignModel):
         # The optical path changes by twice the surface.
         scale = 2 * config.devices.dm.stroke_m * 2 * np.pi / config.system.wavelength_m
         self._pokes = self._measured_pokes(scale) if pupils.pokes else None
+        self._phases = phases or self._build_turbulence()
         if turbulence is None:
-            turbulence = estimate_strength(self.optics(), pupils, _OUTER_SCALE, self._pokes)
+            turbulence = estimate_strength(self.optics(), pupils, self._phases.phases(1.0), self._pokes)
         self.turbulence = turbulence if turbulence >= _NEGLIGIBLE_STRENGTH else 0.0
+        if phases is None and self.turbulence and pupils.residual_tilt:
+            self._phases.estimate_left(self.optics(), pupils, self.turbulence, self._pokes)
         sigma = self._gaussian.pitch_m / np.sqrt(2 * np.log(1 / self._gaussian.coupling))
         if not isinstance(self._nominal, InfluenceFunctions):
             sigma *= _SHARPER
@@ -294,6 +299,7 @@ class PyramidModel(DesignModel):
         return PyramidModel(
             self._config, pupils or self._pupils, modulation=modulation or self._modulation,
             turbulence=self.turbulence if turbulence is None else turbulence, basis=self._modes,
+            phases=self._phases,
         )  # fmt: skip
 
     def _turbulence_uncertainty(self) -> NDArray[np.float64]:
@@ -302,7 +308,7 @@ class PyramidModel(DesignModel):
             return np.zeros(5)
         if self._turbulence_scatter is None:
             optics, x = self.optics(), self._pupil.coordinates_m
-            screens = unit_screens(x.size, _OUTER_SCALE) * self.turbulence ** (5 / 6)
+            screens = self._phases.phases(self.turbulence)
             phases = np.repeat(screens[:, None], _N_SHAPES, axis=1)
             if self._pokes:
                 phases += self._pokes.phases(screens.shape[0] * _N_SHAPES).reshape(phases.shape)
@@ -320,6 +326,14 @@ class PyramidModel(DesignModel):
                 self._config, *self.influence_functions(), self._config.devices.dm.limits.disabled
             )
         return self._modes
+
+    def _build_turbulence(self) -> Turbulence:
+        """Turbulence on this pupil, in closed loop without the modes."""
+        pupil, modes = self._pupil, None
+        if self._pupils.residual_tilt:
+            modes = np.tensordot(self._basis().T, self.influence_functions()[0], 1)
+        distances = sample_distances(len(pupil.coordinates_m), pupil.pixel_m) / self._config.system.pupil_m
+        return Turbulence(_OUTER_SCALE, distances, pupil.lit, modes)
 
     def _measured_pokes(self, scale: float) -> PokePhase:
         """Pokes of the measured rms; ``scale`` converts full stroke of surface to radians of phase."""
@@ -345,10 +359,9 @@ class PyramidModel(DesignModel):
         region = GridRegion(pupils.centres_px, shape, grid, samples)
         structure = None
         if self.turbulence or self._pokes:
-            distances = sample_distances(n, pupil.pixel_m) / self._config.system.pupil_m
-            structure = np.zeros_like(distances)
+            structure = np.zeros((2 * n - 1, 2 * n - 1))
             if self.turbulence:
-                structure += structure_function(distances, 1 / self.turbulence, _OUTER_SCALE)
+                structure = self._phases.structure(self.turbulence)
         return slope_response(
             pupil.amplitude, Prism(region.shifts(n), pupil.n_sub * samples), grid * samples,
             pupils.corners_px - region.first, pupils.valid, self._modulation, structure,

@@ -1,4 +1,4 @@
-"""Turbulence and random pokes in front of a pyramid during a calibration.
+"""Turbulence and random pokes in front of a pyramid, in open and in closed loop.
 
 Their statistics, the turbulence strength estimated from the motion of the slopes, and the registration
 scatter that a finite number of turbulence states leaves.
@@ -6,6 +6,7 @@ scatter that a finite number of turbulence states leaves.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 
 from escape_hw.api.pyramid import PyramidPupils
 from escape_hw.pipeline.slopes.pyramid import slopes_of_image
+from escape_sim.atmosphere.von_karman import structure_function
 from escape_sim.models.pyramid_response import NonuniformPhase
 from escape_sim.optics.pyramid import PyramidOptics
 
@@ -25,6 +27,8 @@ _RMS_ERROR, _PERSISTENCE_ERROR = 0.05, 0.05
 _N_PAIRS = 6
 #: Side of the screens in pupils; must contain the outer scale.
 _SCREEN_PUPILS = 8
+#: Rms tilt in radians whose response tells how much tilt a loop leaves; small enough to be linear.
+_TILT_RAD = 0.1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,16 +67,7 @@ class PokePhase:
 
         The mean over all pairs of lit samples with that separation; 0 if there are none.
         """
-        n = self.lit.shape[0]
-        size = (2 * n, 2 * n)
-        lit = np.fft.rfft2(self.lit.astype(float), size)
-        squares = np.fft.rfft2(np.square(self.modes_rad).sum(axis=0) * self.lit, size)
-        pair = sum(np.square(np.abs(np.fft.rfft2(mode * self.lit, size))) for mode in self.modes_rad)
-        total = np.fft.irfft2(2 * (np.conj(squares) * lit).real - 2 * pair, size)
-        pairs = np.fft.irfft2(np.square(np.abs(lit)), size)
-        mean = np.where(pairs > 0.5, np.maximum(total, 0) / np.maximum(pairs, 1), 0.0)
-        steps = np.arange(1 - n, n)
-        return np.asarray(mean[np.ix_(steps, steps)])
+        return _mean_structure(self.modes_rad, self.lit)
 
     def nonuniform(self) -> NonuniformPhase:
         """Mean structure function, and its variation over the pupil.
@@ -89,14 +84,134 @@ class PokePhase:
         return np.asarray(np.tensordot(draws, self.modes_rad, 1))
 
 
+def _mean_structure(modes_rad: NDArray[np.float64], lit: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Structure function of independent modes ``(k, n, n)``, by the separation of two samples."""
+    n = lit.shape[0]
+    size = (2 * n, 2 * n)
+    weight = np.fft.rfft2(lit.astype(float), size)
+    squares = np.fft.rfft2(np.square(modes_rad).sum(axis=0) * lit, size)
+    pair = sum(np.square(np.abs(np.fft.rfft2(mode * lit, size))) for mode in modes_rad)
+    total = np.fft.irfft2(2 * (np.conj(squares) * weight).real - 2 * pair, size)
+    pairs = np.fft.irfft2(np.square(np.abs(weight)), size)
+    mean = np.where(pairs > 0.5, np.maximum(total, 0) / np.maximum(pairs, 1), 0.0)
+    steps = np.arange(1 - n, n)
+    return np.asarray(mean[np.ix_(steps, steps)])
+
+
 def sample_distances(n: int, pixel_m: float) -> NDArray[np.float64]:
     """Distances in metres of all pairs of samples ``(2 n - 1, 2 n - 1)``, by their separation."""
     steps = np.arange(1 - n, n) * pixel_m
     return np.asarray(np.hypot(steps[:, None], steps))
 
 
+class Turbulence:
+    """Turbulence over the pupil; a closed loop leaves a fraction of what its modes correct.
+
+    Parameters
+    ----------
+    outer_scale
+        In pupil diameters.
+    distances
+        Distances of two samples in pupil diameters ``(2 n - 1, 2 n - 1)``, by their separation.
+    lit
+        Lit samples of the pupil ``(n, n)``.
+    modes
+        Shapes of the corrected modes ``(n_modes, n, n)``, in any unit.
+    """
+
+    def __init__(
+        self,
+        outer_scale: float,
+        distances: NDArray[np.float64],
+        lit: NDArray[np.bool_],
+        modes: NDArray[np.float64] | None = None,
+    ) -> None:
+        self._outer_scale, self._distances, self._lit = outer_scale, distances, lit
+        self._uncorrected = unit_screens(lit.shape[0], outer_scale)
+        self._corrected = self._uncorrected if modes is None else _remove(modes, self._uncorrected, lit)
+        #: Fraction of the amplitude of the corrected modes that is left; 1 in open loop.
+        self.left = 1.0 if modes is None else 0.0
+
+    def phases(self, strength: float) -> NDArray[np.float64]:
+        """Random phases ``(count, n, n)`` in radians, for a number of pupil diameters over r0."""
+        change = self._uncorrected - self._corrected
+        return np.asarray(strength ** (5 / 6) * (self._corrected + self.left * change))
+
+    def structure(self, strength: float) -> NDArray[np.float64]:
+        """Structure function in rad^2 ``(2 n - 1, 2 n - 1)``, by the separation of two samples."""
+        whole = structure_function(self._distances, 1 / strength, self._outer_scale)
+        if self.left == 1:
+            return whole
+        states = self._corrected * (strength ** (5 / 6) / np.sqrt(len(self._corrected)))
+        return np.asarray(self.left**2 * whole + (1 - self.left**2) * _mean_structure(states, self._lit))
+
+    def estimate_left(
+        self, optics: PyramidOptics, pupils: PyramidPupils, strength: float, pokes: PokePhase | None
+    ) -> None:
+        """Set :attr:`left` from the tilt of the slopes, which a loop corrects with the other modes.
+
+        The slopes' mean over the pupil gives the tilt that is left, by the response to a small tilt on the
+        corrected turbulence; pokes are part of it. The tilt without a loop is that of the structure function.
+        """
+        whole = structure_function(self._distances, 1 / strength, self._outer_scale)
+        states = self._corrected * strength ** (5 / 6)
+        ratios = []
+        for axis, tilt in enumerate(_unit_tilts(self._lit)):
+            step = _TILT_RAD * tilt
+            up, down = (
+                np.array([_mean_slopes(optics, pupils, state + change)[axis] for state in states])
+                for change in (step, -step)
+            )
+            response = (up - down).mean() / (2 * _TILT_RAD)
+            # Other modes have a mean slope as well.
+            others = ((up + down) / 2).var(ddof=1)
+            variance = (pupils.residual_tilt**2 - others) / response**2
+            if pokes is not None:
+                variance -= np.square((pokes.modes_rad * tilt)[:, self._lit].mean(axis=1)).sum()
+            ratios.append(max(variance, 0.0) / _projected_variance(tilt / np.count_nonzero(self._lit), whole))
+        self.left = min(float(np.sqrt(np.mean(ratios))), 1.0)
+
+
+def _unit_tilts(lit: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Tilts along x and y ``(2, n, n)`` of rms 1 and mean 0 over the lit samples; 0 elsewhere."""
+    tilts = np.where(lit, np.indices(lit.shape)[::-1].astype(float), 0.0)
+    tilts[:, lit] -= tilts[:, lit].mean(axis=1, keepdims=True)
+    tilts /= np.sqrt(np.square(tilts[:, lit]).mean(axis=1))[:, None, None]
+    return np.asarray(tilts)
+
+
+def _remove(
+    modes: NDArray[np.float64], screens: NDArray[np.float64], lit: NDArray[np.bool_]
+) -> NDArray[np.float64]:
+    """Screens ``(count, n, n)`` without piston and modes over the lit samples; 0 elsewhere."""
+    columns = np.vstack([modes[:, lit], np.ones(np.count_nonzero(lit))]).T
+    basis, inside, rest = np.linalg.qr(columns)[0], screens[:, lit], np.zeros_like(screens)
+    rest[:, lit] = inside - (inside @ basis) @ basis.T
+    return rest
+
+
+def _projected_variance(weights: NDArray[np.float64], structure: NDArray[np.float64]) -> float:
+    """Variance of a sum over the phase with weights ``(n, n)`` whose own sum is 0."""
+    n = len(weights)
+    spectrum = np.square(np.abs(np.fft.rfft2(weights, (2 * n, 2 * n))))
+    steps = np.arange(1 - n, n)
+    products = np.fft.irfft2(spectrum, (2 * n, 2 * n))[np.ix_(steps, steps)]
+    return float(-0.5 * (products * structure).sum())
+
+
+def _mean_slopes(
+    optics: PyramidOptics, pupils: PyramidPupils, phase: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Mean slopes ``(2,)`` over the pupil for a phase ``(n, n)`` in radians."""
+    path = (phase * (optics.wavelength_m / (2 * np.pi))).astype(np.float32)
+    return np.asarray(slopes_of_image(optics.frame(path), pupils).reshape(2, -1).mean(axis=1))
+
+
 def estimate_strength(
-    optics: PyramidOptics, pupils: PyramidPupils, outer_scale: float, pokes: PokePhase | None = None
+    optics: PyramidOptics,
+    pupils: PyramidPupils,
+    screens: NDArray[np.float64],
+    pokes: PokePhase | None = None,
 ) -> float:
     """Estimate the pupil diameters over r0 at the sensor's wavelength from the motion of the slopes.
 
@@ -106,24 +221,29 @@ def estimate_strength(
     The slopes of a pyramid saturate: their rms rises with the turbulence and falls again beyond about
     ten r0 across the pupil. With random pokes, new in every frame, the persistent fraction of the
     variance rises where the rms hardly changes, and the rms falls where the fraction hardly rises; both
-    together determine the strength. Without pokes the rising branch of the rms is used.
+    together determine the strength. Without pokes, and in closed loop, the rising branch of the rms is used.
 
-    ``optics`` is the nominal sensor, ``outer_scale`` in pupil diameters. The result is between 0 (no motion,
-    or none that persists) and the strongest trial.
+    ``optics`` is the nominal sensor, ``screens (count, n, n)`` are phases for a pupil of one r0. The result
+    is between 0 (no motion, or none that persists) and the strongest trial.
     """
     if not pupils.motion:
         return 0.0
-    screens = unit_screens(optics.amplitude.shape[0], outer_scale)
-    if pokes is None:
-        return _strength_from_rms(optics, pupils, screens)
+    if pokes is None or pupils.residual_tilt:
+        return _strength_from_rms(optics, pupils, screens, pokes)
     return _strength_with_pokes(optics, pupils, screens, pokes) if pupils.persistent_fraction else 0.0
 
 
-def _strength_from_rms(optics: PyramidOptics, pupils: PyramidPupils, screens: NDArray[np.float64]) -> float:
+def _strength_from_rms(
+    optics: PyramidOptics, pupils: PyramidPupils, screens: NDArray[np.float64], pokes: PokePhase | None
+) -> float:
     """Strength from the slopes' rms on its rising branch."""
-    values: list[float] = []
+    beside = np.zeros_like(screens) if pokes is None else pokes.phases(len(screens))
+    alone, *values = [float(np.sqrt(np.square(_slopes(optics, pupils, beside)).mean()))]
+    if pupils.motion <= alone:
+        return 0.0
     for ratio in _TRIAL_STRENGTHS:
-        values.append(float(np.sqrt(np.square(_slopes(optics, pupils, screens * ratio ** (5 / 6))).mean())))
+        slopes = _slopes(optics, pupils, screens * ratio ** (5 / 6) + beside)
+        values.append(float(np.sqrt(np.square(slopes).mean())))
         if len(values) > 1 and values[-1] <= values[-2]:
             values.pop()
             break
@@ -131,7 +251,8 @@ def _strength_from_rms(optics: PyramidOptics, pupils: PyramidPupils, screens: ND
             break
     if pupils.motion <= values[0]:
         # Weak turbulence moves the slopes in proportion to the phase.
-        return float(_TRIAL_STRENGTHS[0] * (pupils.motion / values[0]) ** (6 / 5))
+        share = (pupils.motion**2 - alone**2) / (values[0] ** 2 - alone**2)
+        return float(_TRIAL_STRENGTHS[0] * share ** (3 / 5))
     return float(2 ** np.interp(pupils.motion, values, np.log2(_TRIAL_STRENGTHS[: len(values)])))
 
 
@@ -168,6 +289,7 @@ def _slopes(optics: PyramidOptics, pupils: PyramidPupils, phases: NDArray[np.flo
     return np.asarray((slopes - slopes.mean(axis=0)) * np.sqrt(len(slopes) / (len(slopes) - 1)))
 
 
+@functools.cache
 def unit_screens(n: int, outer_scale: float) -> NDArray[np.float64]:
     """Von Kármán phases ``(2 * _N_PAIRS, n, n)`` in radians with a pupil of one r0."""
     size = _SCREEN_PUPILS * n
@@ -180,7 +302,9 @@ def unit_screens(n: int, outer_scale: float) -> NDArray[np.float64]:
         noise = rng.standard_normal((size, size)) + 1j * rng.standard_normal((size, size))
         pair = np.fft.fft2(noise * amplitude)[:n, :n]
         screens += [pair.real, pair.imag]
-    return np.stack(screens)
+    out = np.stack(screens)
+    out.setflags(write=False)
+    return out
 
 
 #: Rms path of a mirror shape in waves, in the linear range.
