@@ -72,7 +72,8 @@ def test_an_exposure_is_typed_checked_and_applied(
     qtbot.mouseClick(dialog.apply_button, Qt.MouseButton.LeftButton)
     qtbot.waitUntil(lambda: "Applied" in dialog.message.text())
     assert ("set_camera", {"camera": "wfs", "exposure_s": pytest.approx(0.7e-3)}) in control.asked
-    assert dialog.current["exposure_s"].text() == "0.7000"
+    # The settings are read again after the message.
+    qtbot.waitUntil(lambda: dialog.current["exposure_s"].text() == "0.7000")
 
 
 def test_a_region_is_sent_as_a_whole_and_a_refusal_is_shown(
