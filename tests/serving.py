@@ -52,7 +52,9 @@ class Served:
         self, words: tuple[object, ...], folder: Path, more: Mapping[str, str] | None = None
     ) -> None:
         self.folder, self._words, self._more = folder, words, dict(more or {})
-        (folder / "run").mkdir(mode=0o700, parents=True, exist_ok=True)
+        # Sockets are not put below a folder that others may change.
+        for private in (folder, folder / "run"):
+            private.mkdir(mode=0o700, parents=True, exist_ok=True)
         self.environment = {
             **os.environ, **self._more, "OPENBLAS_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1",
             "XDG_DATA_HOME": str(folder / "data"), "XDG_RUNTIME_DIR": str(folder / "run"),
