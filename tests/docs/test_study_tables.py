@@ -14,10 +14,11 @@ from escape_hw.runtime.session.system import System
 
 #: Scripts that only print, if their raw table has all realisations.
 SCRIPTS = (
-    "capture_range", "constants", "lenslet_pokes", "neighbouring_spots", "nuisances", "registration_errors",
+    "capture_range", "closed_loop_response", "constants", "lenslet_pokes", "neighbouring_spots", "nuisances",
+    "registration_errors",
 )  # fmt: skip
 COMMAND = re.compile(
-    rf"^python (benchmarks/studies/registration/(?:{'|'.join(SCRIPTS)})\.py .*--out docs/.*)$", re.MULTILINE
+    rf"^python (benchmarks/studies/(?:registration|turbulence)/(?:{'|'.join(SCRIPTS)})\.py .*--out docs/.*)$", re.MULTILINE
 )
 TEXTS = [page.read_text(encoding="utf-8") for page in EVERY]
 QUOTED = [(text, command) for text in TEXTS for command in COMMAND.findall(text)]
