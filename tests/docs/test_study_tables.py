@@ -18,7 +18,8 @@ SCRIPTS = (
     "registration_errors",
 )  # fmt: skip
 COMMAND = re.compile(
-    rf"^python (benchmarks/studies/(?:registration|turbulence)/(?:{'|'.join(SCRIPTS)})\.py .*--out docs/.*)$", re.MULTILINE
+    rf"^python (benchmarks/studies/(?:registration|turbulence)/(?:{'|'.join(SCRIPTS)})\.py .*--out docs/.*)$",
+    re.MULTILINE,
 )
 TEXTS = [page.read_text(encoding="utf-8") for page in EVERY]
 QUOTED = [(text, command) for text in TEXTS for command in COMMAND.findall(text)]
