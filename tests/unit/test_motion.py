@@ -68,6 +68,23 @@ def test_a_resumed_run_gives_the_same() -> None:
     # Two pairs across the interruption are lost.
     assert other.n_effective == pytest.approx(one.n_effective, rel=0.03)
     assert other.persistent_fraction == pytest.approx(one.persistent_fraction, abs=0.02)
+    seen = slopes.reshape(300, 2, 8).mean(axis=2)
+    for statistics in (whole, second):
+        closed = statistics.annotate_geometry(pupils(), closed=True)
+        assert isinstance(closed, PyramidPupils)
+        assert closed.residual_tilt == pytest.approx(np.sqrt(seen.var(axis=0).mean()), rel=1e-4)
+    assert one.residual_tilt == 0
+
+
+def test_a_state_of_version_0_1_0_has_no_tilt() -> None:
+    saved = SlopeStatistics(16)
+    for k in range(5):
+        saved.add(np.full(16, k, np.float32))
+    state = saved.state()
+    state[2] = state[2, 0]
+    restored = SlopeStatistics(16)
+    restored.restore(state)
+    assert restored.state()[2, :2].tolist() == [5.0, 0.0]
 
 
 def test_a_closed_loop_gives_no_turbulence_within_a_lenslet() -> None:

@@ -67,25 +67,27 @@ class SlopeStatistics:
         self._tilt_power += float(np.square(tilts).mean(axis=1).sum())
 
     def state(self) -> NDArray[np.float64]:
-        """All sums and counts ``(8 + blocks, n_slopes)``, for :meth:`restore`."""
+        """All sums and counts ``(7 + blocks, n_slopes)``, for :meth:`restore`."""
         numbers = (
             float(self._n_frames),
             self._poke_power,
             self._lag_products,
             float(self._n_lag_pairs),
             float(self._block_length),
-            self._tilt_power,
         )
         rows = (np.full(self.n_slopes, number) for number in numbers)
-        return np.stack([self._sum, self._sum_of_squares, *rows, *self._blocks])
+        out = np.stack([self._sum, self._sum_of_squares, *rows, *self._blocks])
+        # Version 0.1.0, whose states can be resumed, has the number of frames here as well.
+        out[2, 1] = self._tilt_power
+        return out
 
     def restore(self, state: NDArray[np.float64]) -> None:
         """Continue from the array of :meth:`state`."""
         self._sum, self._sum_of_squares, self._n_frames = state[0].copy(), state[1].copy(), int(state[2, 0])
         self._poke_power, self._lag_products = float(state[3, 0]), float(state[4, 0])
         self._n_lag_pairs, self._block_length = int(state[5, 0]), int(state[6, 0])
-        self._tilt_power = float(state[7, 0])
-        self._blocks = [row.copy() for row in state[8:]]
+        self._tilt_power = float(state[2, 1]) if state[2, 1] != state[2, 0] else 0.0
+        self._blocks = [row.copy() for row in state[7:]]
         self._recent_slopes.clear()
 
     def annotate_geometry(self, grid: SensorGeometry, *, closed: bool = False) -> SensorGeometry:
