@@ -4,7 +4,7 @@
 
 Each realisation, as in ``registration_errors.py``, has a mirror of Gaussian influence functions, with which
 scalings are known best, and is measured with DO-CRIME under turbulence. SPRINT fits the matrix with the model
-as it is, in which the spots of neighbouring lenslets move independently, and with one in which they have the
+of the package, in which the spots of neighbouring lenslets move independently, and with one in which they have the
 same motion; both also without the x slopes and without the y slopes. Writes ``SYSTEM.jsonl``, a line per
 realisation. Prints the mean errors of the scalings in % of the diameter with the standard error of that mean,
 and mean squared errors over squared standard errors. A realisation takes half a minute of a core.
