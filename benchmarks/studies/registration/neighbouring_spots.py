@@ -3,11 +3,12 @@
     python benchmarks/studies/registration/neighbouring_spots.py --out docs/studies/neighbouring-spots
 
 Each realisation, as in ``registration_errors.py``, has a mirror of Gaussian influence functions, with which
-scalings are known best, and is measured with DO-CRIME under turbulence. SPRINT fits the matrix with the model
-of the package, in which the spots of neighbouring lenslets move independently, and with one in which they have the
-same motion; both also without the x slopes and without the y slopes. Writes ``SYSTEM.jsonl``, a line per
-realisation. Prints the mean errors of the scalings in % of the diameter with the standard error of that mean,
-and mean squared errors over squared standard errors. A realisation takes half a minute of a core.
+scalings are known best, and is measured with DO-CRIME under turbulence. SPRINT fits the matrix with the
+package's model, in which the spots of neighbouring lenslets move independently, and with one in which they
+have the same motion; both also without the x slopes and without the y slopes. Writes ``SYSTEM.jsonl``, a
+line per realisation. Prints the mean errors of the scalings in % of the diameter with the standard error of
+that mean, and mean squared errors over squared standard errors. A realisation takes half a minute of a
+core.
 """
 
 from __future__ import annotations

@@ -34,15 +34,15 @@ from escape_hw.calibration.loop.control import build_integrator
 from escape_hw.calibration.loop.runner import RunningLoop
 from escape_hw.calibration.sprint.fit import sprint, sprint_options_from_config
 from escape_hw.paper.sky_time import realisation_config
-from escape_hw.pipeline.slopes.pyramid import slopes_of_image
 from escape_hw.runtime.session.system import System
-from escape_sim.devices.bench import SimBench
-from escape_sim.devices.true_optical_gains import WavefrontRecorder, get_simulated_bench
+from escape_sim.devices.true_optical_gains import (
+    WavefrontRecorder,
+    get_simulated_bench,
+    true_responses,
+)
 
 #: Frames of the loop before and while wavefronts are recorded, and frames from one wavefront to the next.
 _SETTLING, _FRAMES, _EVERY = 600, 6000, 150
-#: Poke of the push-pull in metres of optical path, rms.
-_POKE_M = 2e-9
 #: Standard error of the mean response relative to that of the calibration.
 _NOISE = 0.5
 
@@ -61,23 +61,6 @@ def measure_closed_loop(
     return require_kind(statistics.annotate_geometry(pupils, closed=True), PyramidPupils), recorder.wavefronts
 
 
-def mean_response(
-    twin: SimBench, pupils: PyramidPupils, m2c: NDArray[np.float64], wavefronts: Sequence[NDArray[np.float32]]
-) -> NDArray[np.float64]:
-    """Mean slopes per unit of each mode ``(n_slopes, n_modes)`` around wavefronts, without noise."""
-    amplitude = _POKE_M / (2 * twin.config.devices.dm.stroke_m)
-    sensor, columns = twin.sensor(), []
-    for mode in m2c.T:
-        shape = twin.mirror_opd(mode * amplitude)
-        changes = [
-            slopes_of_image(sensor.frame(wavefront + shape), pupils)
-            - slopes_of_image(sensor.frame(wavefront - shape), pupils)
-            for wavefront in wavefronts
-        ]
-        columns.append(np.mean(changes, axis=0) / (2 * amplitude))
-    return np.stack(columns, axis=1)
-
-
 def run_realisation(system: str, number: int, frames: int) -> Line:
     """Errors of both fits, with the stated ones and the strength of the turbulence."""
     _, config = realisation_config(system, number, [])
@@ -89,7 +72,8 @@ def run_realisation(system: str, number: int, frames: int) -> Line:
         )
         twin, m2c = get_simulated_bench(bench), result.matrix.m2c
         truth = twin.flexure.at(twin.now_s).to_array()
-        data = mean_response(twin, pupils, m2c, wavefronts).astype(np.float32)
+        columns = [true_responses(twin, pupils, mode, wavefronts).mean(axis=0) for mode in m2c.T]
+        data = np.stack(columns, axis=1).astype(np.float32)
         sigma = np.full_like(data, _NOISE * np.median(result.matrix.sigma))
         matrix = replace(result.matrix, data=data, sigma=sigma)
         line: Line = {"wavefronts": len(wavefronts)}

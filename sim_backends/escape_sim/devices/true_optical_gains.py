@@ -46,6 +46,26 @@ class WavefrontRecorder:
         self._twin.path_callbacks.remove(self)
 
 
+def true_responses(
+    twin: SimBench,
+    pupils: PyramidPupils,
+    mode: NDArray[np.float64],
+    wavefronts: Sequence[NDArray[np.float32]],
+) -> NDArray[np.float64]:
+    """Slopes per unit of a mode ``(n_act,)`` by noiseless push-pull around wavefronts, one row for each.
+
+    Other parameters as for :func:`true_optical_gains`.
+    """
+    amplitude = _POKE_M / (2 * twin.config.devices.dm.stroke_m)
+    shape, sensor = twin.mirror_opd(mode * amplitude), twin.sensor()
+    changes = [
+        slopes_of_image(sensor.frame(wavefront + shape), pupils)
+        - slopes_of_image(sensor.frame(wavefront - shape), pupils)
+        for wavefront in wavefronts
+    ]
+    return np.stack(changes) / (2 * amplitude)
+
+
 def true_optical_gains(
     twin: SimBench,
     pupils: PyramidPupils,
@@ -78,14 +98,7 @@ def true_optical_gains(
         NaN for modes not selected.
     """
     selected = range(m2c.shape[1]) if modes is None else modes
-    stroke = twin.config.devices.dm.stroke_m
-    amplitude = _POKE_M / (2 * stroke)
     gains = np.full((len(wavefronts), m2c.shape[1]), np.nan)
-    sensor = twin.sensor()
     for mode in selected:
-        shape = twin.mirror_opd(m2c[:, mode] * amplitude)
-        for k, wavefront in enumerate(wavefronts):
-            slopes_up = slopes_of_image(sensor.frame(wavefront + shape), pupils)
-            slopes_down = slopes_of_image(sensor.frame(wavefront - shape), pupils)
-            gains[k, mode] = rows[mode] @ (slopes_up - slopes_down) / (2 * amplitude)
+        gains[:, mode] = true_responses(twin, pupils, m2c[:, mode], wavefronts) @ rows[mode]
     return gains
