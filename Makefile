@@ -1,13 +1,16 @@
 # Needs only make and Python 3.11 or newer; every target creates .venv and installs what it needs.
 # ARGS="..." is handed on to the command behind a target.
 
-VENV := .venv
+# make test CONSTRAINTS=constraints.txt: the versions that were tested together, in an environment of their own.
+CONSTRAINTS :=
+TESTED := .venv-tested
+VENV := $(if $(CONSTRAINTS),$(TESTED),.venv)
 BIN := $(VENV)/bin
 FIND = for p in python3.13 python3.12 python3.11 python3; do \
 	if $$p -c 'import sys, venv, ensurepip; sys.exit(sys.version_info < (3, 11))' 2>/dev/null; \
 	then echo $$p; break; fi; done
 PYTHON ?= $(shell $(FIND))
-PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet
+PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet $(addprefix --constraint ,$(CONSTRAINTS))
 
 # Environment of a second Python: make test VENV=.venv-other PYTHON=python3.13
 OTHER := .venv-other
@@ -59,7 +62,7 @@ perf: $(VENV)/bench.stamp ## Measure speed against OOPAO and pyRTC
 	$(BIN)/escape perf $(ARGS)
 
 clean: ## Remove the environment and caches
-	rm -rf $(VENV) $(OTHER) $(FLOOR) .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+	rm -rf $(VENV) $(TESTED) $(OTHER) $(FLOOR) .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
 
 python: # Say which Python the environment is made with
 	@test -n "$(PYTHON)" && echo "$(PYTHON)"
@@ -68,10 +71,10 @@ $(BIN)/python:
 	@test -n "$(PYTHON)" || { echo "No Python 3.11 or newer with venv found; set PYTHON=..." >&2; exit 1; }
 	$(PYTHON) -m venv $(VENV)
 
-$(VENV)/run.stamp: pyproject.toml | $(BIN)/python
+$(VENV)/run.stamp: pyproject.toml $(CONSTRAINTS) | $(BIN)/python
 	$(PIP) --editable .
 	@touch $@
 
-$(VENV)/%.stamp: pyproject.toml | $(BIN)/python
+$(VENV)/%.stamp: pyproject.toml $(CONSTRAINTS) | $(BIN)/python
 	$(PIP) --editable '.[$*]'
 	@touch $@

@@ -5,7 +5,9 @@ from __future__ import annotations
 import configparser
 import contextlib
 import importlib.metadata
+import os
 import re
+import shutil
 import subprocess
 import sys
 import tomllib
@@ -107,8 +109,68 @@ def test_the_desktop_entry_starts_the_window() -> None:
 
 
 def test_the_hosted_run_is_the_local_one() -> None:
-    steps = re.findall(r"^ +- run: (.*)$", text(".github/workflows/ci.yml"), re.MULTILINE)
+    run, container = text(".github/workflows/ci.yml").split("\n  container:\n")
+    steps = re.findall(r"^ +- run: (.*)$", run, re.MULTILINE)
     assert steps == ["sudo python3 tests/system_packages.py --install", ".ci/run"]
+    assert "docker build --file Containerfile --tag escape ." in container
+    assert "docker run --rm escape --version" in container
+
+
+def test_every_python_that_the_package_names_is_tested() -> None:
+    named = re.findall(r"Python :: 3\.(\d+)$", "\n".join(PROJECT["classifiers"]), re.MULTILINE)
+    hosted = re.findall(r"^ +3\.(\d+)$", text(".github/workflows/ci.yml"), re.MULTILINE)
+    (installed,) = re.findall(
+        r'parametrize\("minor", \[([\d, ]+)\]\)', text("tests/packaging/test_install.py")
+    )
+    assert named == hosted == installed.split(", ")
+    assert PROJECT["requires-python"] == f">=3.{named[0]}"
+
+
+def test_an_environment_is_made_with_the_tested_versions() -> None:
+    if shutil.which("make") is None:
+        pytest.skip("make is not installed")
+    words = ["make", "--dry-run", "--always-make", f"PYTHON={sys.executable}", "test"]
+    done = [
+        subprocess.run([*words, *more], cwd=ROOT, capture_output=True, text=True, check=True, timeout=60)
+        for more in ([], ["CONSTRAINTS=constraints.txt"])
+    ]
+    newest, tested = (one.stdout for one in done)
+    assert "-m venv .venv\n" in newest
+    assert "--constraint" not in newest
+    assert "-m venv .venv-tested\n" in tested
+    assert re.search(
+        r"^\.venv-tested/bin/python -m pip .* --constraint constraints\.txt --editable", tested, re.MULTILINE
+    )
+
+
+@pytest.mark.parametrize("works", [True, False])
+def test_continuous_integration_says_that_the_oldest_versions_are_skipped(
+    works: bool, tmp_path: Path
+) -> None:
+    """With programs that only print what they are called with."""
+    for name, does in {
+        "bin/make": 'echo "make $*"',
+        "bin/id": "echo 1000",
+        "bin/python3.11": f"exit {0 if works else 1}",
+        ".venv/bin/python": "exit 0",
+    }.items():
+        program = tmp_path / name
+        program.parent.mkdir(parents=True, exist_ok=True)
+        program.write_text(f"#!/bin/sh\n{does}\n", encoding="utf-8")
+        program.chmod(0o755)
+    (tmp_path / ".ci").mkdir()
+    run = shutil.copy(ROOT / ".ci" / "run", tmp_path / ".ci" / "run")
+    environment = {"PATH": f"{tmp_path / 'bin'}:{os.environ['PATH']}", "HOME": str(tmp_path)}
+    printed = [
+        subprocess.run([run], env=environment | more, capture_output=True, text=True, check=True, timeout=60)
+        for more in ({}, {"CI_VERSIONS": "1"})
+    ]
+    usual, versions = (one.stdout for one in printed)
+    skipped = "oldest versions skipped: no python3.11 with venv found"
+    assert "make floor" not in usual
+    assert skipped not in usual
+    assert ("make floor" in versions) is works
+    assert (skipped in versions) is not works
 
 
 #: Marks of tests that continuous integration does not run, and why; CONTRIBUTING.md says when they are run.
