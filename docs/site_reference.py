@@ -33,9 +33,9 @@ def write_pages(docs: Path) -> None:
     folder = docs / FOLDER
     folder.mkdir(parents=True, exist_ok=True)
     api = (docs / "reference" / "api.md").read_text(encoding="utf-8")
-    listed = set(re.findall(r"^   (\w+)$", api, re.MULTILINE))
+    listed = set(re.findall(r"^   ([\w.]+)$", api, re.MULTILINE))
     for page in folder.glob("*.rst"):
-        if page.stem.removeprefix("escape_hw.") not in listed:
+        if page.stem.partition(".")[2] not in listed:
             page.unlink()
     for name, text in (
         ("configuration.md", "\n".join(configuration_page())),

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from escape_hw import errors, testing
     from escape_hw.api.adaptive_secondary import AdaptiveSecondary, ShellHealth, ShellState
     from escape_hw.api.camera import Camera, CameraInfo, CameraSettings, Frame, Region
+    from escape_hw.api.device import Device
     from escape_hw.api.influence import InfluenceEstimate, InfluenceProfile
     from escape_hw.api.interaction_matrix import InteractionMatrix
     from escape_hw.api.mirror import DeformableMirror, DMInfo, SendReport
@@ -60,6 +61,7 @@ if TYPE_CHECKING:
 _NAMES = {
     "escape_hw.api.adaptive_secondary": "AdaptiveSecondary ShellHealth ShellState",
     "escape_hw.api.camera": "Camera CameraInfo CameraSettings Frame Region",
+    "escape_hw.api.device": "Device",
     "escape_hw.api.influence": "InfluenceEstimate InfluenceProfile",
     "escape_hw.api.interaction_matrix": "InteractionMatrix",
     "escape_hw.api.mirror": "DMInfo DeformableMirror SendReport",
@@ -101,7 +103,7 @@ _PUBLIC_MODULES = {
 
 __all__ = [
     "AdaptiveSecondary", "CalibrationResult", "Camera", "CameraInfo", "CameraSettings", "Checkpoint",
-    "Connection", "DMInfo", "DeformableMirror", "DeviceContext", "Estimate", "Frame",
+    "Connection", "DMInfo", "DeformableMirror", "Device", "DeviceContext", "Estimate", "Frame",
     "InfluenceEstimate", "InfluenceProfile", "InteractionMatrix", "LoopResult", "MirrorLimits",
     "Modulation", "ModulatorInfo", "ModulatorStatus", "PhaseScreen", "Procedure", "Progress",
     "PyramidPupils", "Region", "Registration", "RegistrationEstimate", "Reporter", "ScreenInfo",

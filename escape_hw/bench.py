@@ -288,7 +288,7 @@ def build_standalone_device(driver: str, kind: type[D], /, **settings: Any) -> D
     return call_factory(f"driver '{driver}'", kind, partial(made_by, **settings))
 
 
-def open_device(driver: str, /, **settings: Any) -> Device:
+def open_device(driver: str, /, **settings: Any) -> Any:
     """Open one device by its driver, without a system file.
 
     For example::
@@ -306,6 +306,12 @@ def open_device(driver: str, /, **settings: Any) -> Device:
     **settings
         Keywords of the driver's class: ``serial``, the options on the page of the device, and ``limits``, all
         (``MirrorLimits``) or a table of those that differ.
+
+    Returns
+    -------
+    Any
+        The open device, of the driver's class, which depends on the name. ``dm: escape_hw.DeformableMirror =
+        escape_hw.open_device(...)`` states it to type checkers.
 
     Raises
     ------
