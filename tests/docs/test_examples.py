@@ -90,7 +90,9 @@ def test_own_procedure(tmp_path: Path) -> None:
 def test_own_device(tmp_path: Path) -> None:
     out = run("own_device.py", tmp_path)
     outcomes = re.findall(r"^ *(\w+)  check_", out, re.MULTILINE)
-    assert len(outcomes) > 15
     assert set(outcomes) <= {"passed", "skipped"}
-    assert outcomes.count("passed") > 15
+    assert len(re.findall(r"passed  check_mirror", out)) > 15
+    assert len(re.findall(r"passed  check_camera", out)) > 15
+    assert "Acme 640: frame of (512, 640), darkest pixel 1" in out
     assert "Acme 97: requested 0.9, sent 0.500" in out
+    assert 50 <= number(r"Acme 640 as science: darkest pixel (\d+)", out) < 66
