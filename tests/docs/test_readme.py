@@ -87,9 +87,20 @@ def test_other_shell_lines_are_the_install_steps() -> None:
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
     others = [line for line in shell_lines() if line and not line.startswith(("make ", "escape "))]
     for line in others:
-        assert line.startswith(("python3 -m venv", "pip install --editable", "pytest")), line
+        steps = ("python3 -m venv", ". .venv/bin/activate", "pip install --editable", "pytest")
+        assert line.startswith(steps), line
         for extra in re.findall(r"\[([a-z,]+)\]", line):
             assert set(extra.split(",")) <= set(extras)
+
+
+def test_the_environment_is_activated_before_its_commands_are_called() -> None:
+    lines = [line.strip() for block in blocks("sh") for line in block.splitlines()]
+    assert lines.index(". .venv/bin/activate") < lines.index(escape_lines()[0])
+    for page in (
+        TOUR,
+        *((ROOT / "docs/tutorial" / name).read_text() for name in ("bench.md", "operator.md")),
+    ):
+        assert 0 <= page.find("`. .venv/bin/activate`") < re.search(r"^(\$ )?escape ", page, re.M).start()
 
 
 def test_mistakes_are_reported_as_shown(tmp_path: Path) -> None:
