@@ -49,7 +49,8 @@ def test_a_mirror_of_an_unknown_arrangement_is_flattened_and_poked(escape, caplo
         (["poke", "97", "0.1"], 3, "actuator 97 does not exist; the mirror has 0 to 96"),
         (["poke", "0", "0.6"], 3, "a poke of 0.6 at actuator 0 is beyond its limits"),
         (["flat", "--mode", "sim"], 2, "not with --driver"),
-        (["flat", "--set", "limits.max_stroke=2"], 2, "max_stroke is 2; it must lie in"),
+        (["flat", "--set", "limits.max_stroke=2"], 2, "alpao.limits.max_stroke: 2  is out of range"),
+        (["flat", "--set", "limits=5"], 2, "alpao.limits: 5  must be a table"),
         (["flat", "--set", "trigger_in=up"], 2, "alpao.trigger_in: 'up'  must be"),
         (["flat", "razor-shwfs"], 2, "unexpected extra argument"),
     ],
@@ -86,7 +87,7 @@ def test_a_camera_is_read_by_its_driver(document, tmp_path) -> None:
 
 @pytest.mark.usefixtures("short_auto_zero")
 def test_a_stage_is_turned_by_its_driver(document, escape) -> None:
-    words = ["--driver", "pi-e727", "--set", "kind=emulator"]
+    words = ["--driver", "pi-e727", "--serial", "0123456789", "--set", "kind=emulator"]
     circle = ["--radius-rad", 1.4e-4, "--frequency", 303.0, "--seconds", 0]
     code, found, _ = document("modulator", "start", *words, *circle)
     assert (code, found["left"], found["asked"]["radius_rad"]) == (0, "parked", 1.4e-4)
