@@ -210,7 +210,7 @@ def test_too_many_skipped_commands_in_a_row_are_an_error() -> None:
             made.inject("skip")
         for _ in range(2):
             assert mirror.send(np.zeros(336)).skipped
-        with pytest.raises(DeviceError, match=r"skipped 3 commands in a row .* lower max_slew"):
+        with pytest.raises(DeviceError, match=r"skipped 3 commands in a row .* lower limits.max_slew"):
             mirror.send(np.zeros(336))
 
 

@@ -113,7 +113,7 @@ def test_the_guard_limits_every_command_of_a_mirror_used_alone() -> None:
 def test_settings_of_a_device_used_alone_are_checked() -> None:
     with pytest.raises(ConfigError, match=r"^alpao\.triger_in: unknown option \(did you mean 'trigger_in'\?"):
         mirror(triger_in="off")
-    with pytest.raises(ConfigError, match="did you mean 'stroke_m'. there are: serial, .*layout, pitch_m,"):
+    with pytest.raises(ConfigError, match=r"did you mean 'stroke_m'. there are: serial, .*layout, pitch_m,"):
         mirror(strok_m=1e-6)
     with pytest.raises(ConfigError, match="by its serial number only"):
         AlpaoMirror(serial=" ")
@@ -278,7 +278,7 @@ def test_numbering_sign_and_flip_are_given_as_in_a_system_file() -> None:
         plain = device.next_frame(5.0).data
     with escape_hw.open_device("ximea", flip="transpose", **region, **words) as device:
         assert np.array_equal(device.next_frame(5.0).data, plain.T)
-    with pytest.raises(SettingRejected, match="must be square, since flip = 'turn-90'"):
+    with pytest.raises(SettingRejected, match="must be square, since flip"):
         escape_hw.open_device("ximea", flip="turn-90", **words)
-    with pytest.raises(ConfigError, match="ximea.flip: 'x'  must be 'none'"):
+    with pytest.raises(ConfigError, match=r"ximea\.flip: 'x'  must be 'none'"):
         escape_hw.open_device("ximea", flip="x", **words)
