@@ -12,6 +12,7 @@ from driver_bench import fresh, stand_in
 
 import escape_hw
 from escape_drivers.alpao import AlpaoMirror
+from escape_drivers.aravis import AravisCamera
 from escape_drivers.asm import AsmMirror
 from escape_drivers.common.options import known_layout
 from escape_drivers.pi import PiModulator
@@ -161,6 +162,10 @@ def test_a_region_off_the_sensor_is_refused() -> None:
         device.open()
     assert not device.is_open
     assert not stand_in("m3api").violations
+    fresh("aravis", "set serial 17")
+    device = AravisCamera(serial=17, region=(0, 500, 64, 64), library=str(stand_in("aravis").path))
+    with pytest.raises(SettingRejected, match="does not lie on the sensor of 720 x 540 pixels"):
+        device.open()
 
 
 def test_serial_numbers_may_be_whole_numbers() -> None:
