@@ -352,12 +352,12 @@ def _order_of(driver: str, mirror: DeformableMirror, order: str) -> NDArray[np.i
 
 def _positions_in_pitches(mirror: DeformableMirror, order: str) -> NDArray[np.float64]:
     """Positions of the actuators ``(n_act, 2)`` before the mirror is opened; ``ValueError`` if not known."""
+    if order.startswith("numbers:"):
+        # Needs no positions; opening the mirror compares how many there are.
+        return np.zeros((order.count(",") + 1, 2))
     try:
         positions = mirror.info.positions_m
     except NotOpen:
-        if order.startswith("numbers:"):
-            # Needs no positions; opening the mirror compares how many there are.
-            return np.zeros((order.count(",") + 1, 2))
         raise ValueError("needs the arrangement of the actuators; give layout") from None
     pairs = nearest_pairs(positions)
     pitch = np.median(np.hypot(*(positions[pairs[:, 0]] - positions[pairs[:, 1]]).T))

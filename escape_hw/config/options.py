@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, TypeVar
 
+import numpy as np
 from pydantic import ValidationError
 from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
@@ -28,7 +29,7 @@ def parse_options(
     where
         Begins the names of settings in messages: a device, or a table of a system file.
     options
-        The settings by their names.
+        The settings by their names; numbers and arrays may be those of numpy.
     also
         Names that are settings too, but not of this section; for suggestions.
 
@@ -38,12 +39,21 @@ def parse_options(
         Every unknown option (with the nearest one) and every wrong value, at once.
     """
     try:
-        return kind.model_validate(dict(options))
+        return kind.model_validate(_plain(options))
     except ValidationError as error:
         details = error.errors(include_url=False)
         raise ConfigError(
             "\n".join(line for detail in details for line in _describe(kind, where, detail, also))
         ) from None
+
+
+def _plain(value: Any) -> Any:
+    """A value without numpy, as it is in a system file."""
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    if isinstance(value, Mapping):
+        return {key: _plain(inner) for key, inner in value.items()}
+    return [_plain(inner) for inner in value] if isinstance(value, list | tuple) else value
 
 
 def _describe(kind: type[Section], where: str, detail: ErrorDetails, also: Iterable[str]) -> Iterator[str]:

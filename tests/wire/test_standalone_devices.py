@@ -130,7 +130,7 @@ def test_a_camera_takes_the_size_of_its_sensor_from_the_library() -> None:
         assert rows > 0
         assert device.settings.region == escape_hw.Region(0, 0, columns, rows)
         assert device.next_frame(5.0).data.shape == (rows, columns)
-    with camera(region=(16, 8, 64, 32), exposure_s=2e-4, frame_rate_hz=100.0) as device:
+    with camera(region=np.array([16, 8, 64, 32]), exposure_s=2e-4, frame_rate_hz=100.0) as device:
         assert device.next_frame(5.0).data.shape == (32, 64)
     with pytest.raises(DeviceError, match="sensor_px is 5 x 5"):
         camera(sensor_px=(5, 5)).open()
@@ -246,6 +246,8 @@ def test_limits_of_a_device_used_alone_may_be_a_table() -> None:
     words = {"serial": "BAX118", "library": str(stand_in("asdk").path)}
     with escape_hw.open_device("alpao", limits={"max_stroke": 0.3}, **words) as dm:
         assert dm.limits == replace(CAUTIOUS_LIMITS, max_stroke=0.3)
+    with escape_hw.open_device("alpao", limits={"disabled": tuple(np.arange(2))}, **words) as dm:
+        assert dm.limits == replace(CAUTIOUS_LIMITS, disabled=(0, 1))
     for wrong, message in (
         ({"max_stork": 0.3}, "alpao.limits.max_stork: unknown option .did you mean 'max_stroke'"),
         ({"max_stroke": 3}, "alpao.limits.max_stroke: 3  is out of range"),
