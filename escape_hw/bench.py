@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import inspect
 import logging
 import zlib
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self, TypeVar
@@ -22,7 +23,17 @@ from escape_hw.api.modulator import TipTiltModulator
 from escape_hw.api.phase_screen import PhaseScreen
 from escape_hw.api.sensor import SensorGeometry
 from escape_hw.api.synthetic_model import SyntheticModel
-from escape_hw.config.devices import CameraConfig, DeviceConfig, MirrorConfig, SensorCameraConfig
+from escape_hw.config.devices import (
+    CameraConfig,
+    CameraOrientation,
+    DeviceConfig,
+    LimitsConfig,
+    MirrorConfig,
+    MirrorOrientation,
+    SensorCameraConfig,
+    hardware_order,
+)
+from escape_hw.config.options import parse_options
 from escape_hw.config.registry import (
     DeviceContext,
     call_factory,
@@ -30,10 +41,11 @@ from escape_hw.config.registry import (
     device_factory,
     model_factory,
 )
+from escape_hw.config.section import Section
 from escape_hw.config.system import SystemConfig
 from escape_hw.deprecation import renamed_members
-from escape_hw.errors import ConfigError, ProductError
-from escape_hw.safety.limits import CAUTIOUS_LIMITS
+from escape_hw.errors import ConfigError, NotOpen, ProductError
+from escape_hw.safety.limits import CAUTIOUS_LIMITS, MirrorLimits, nearest_pairs
 
 if TYPE_CHECKING:
     from threadpoolctl import _ThreadpoolLimiter
@@ -269,8 +281,9 @@ def build_standalone_device(driver: str, kind: type[D], /, **settings: Any) -> D
     kind
         Required class of the device.
     **settings
-        Keywords of the driver's class, such as ``serial``; ``limits`` may be a table of those that differ
-        from :data:`CAUTIOUS_LIMITS <escape_hw.safety.limits.CAUTIOUS_LIMITS>`.
+        Keywords of the driver's class, such as ``serial``. Of a mirror also ``order`` and ``polarity`` and of
+        a camera ``flip``, as in a system file; ``limits`` may be a table of those that differ from
+        :data:`CAUTIOUS_LIMITS <escape_hw.safety.limits.CAUTIOUS_LIMITS>`.
 
     Raises
     ------
@@ -279,13 +292,76 @@ def build_standalone_device(driver: str, kind: type[D], /, **settings: Any) -> D
         take these settings.
     """
     made_by = device_class(driver)
-    limits = settings.get("limits")
-    if isinstance(limits, Mapping):
-        try:
-            settings["limits"] = replace(CAUTIOUS_LIMITS, **limits)
-        except (TypeError, ValueError) as error:
-            raise ConfigError(f"driver '{driver}': limits: {error}") from error
-    return call_factory(f"driver '{driver}'", kind, partial(made_by, **settings))
+    _require_arguments(driver, made_by, settings)
+    if issubclass(made_by, DeformableMirror) and "limits" in settings:
+        settings["limits"] = _parse_limits(f"{driver}.limits", settings["limits"])
+    turned_by = _orientation_keys(made_by)
+    given = {key: settings.pop(key) for key in turned_by.model_fields if key in settings}
+    orientation = parse_options(turned_by, driver, given)
+    device = call_factory(f"driver '{driver}'", kind, partial(made_by, **settings))
+    if isinstance(device, Camera) and isinstance(orientation, CameraOrientation):
+        device.flip = orientation.flip
+    elif isinstance(device, DeformableMirror) and isinstance(orientation, MirrorOrientation):
+        device.order, device.polarity = _order_of(driver, device, orientation.order), orientation.polarity
+    return device
+
+
+def _orientation_keys(made_by: type[Device]) -> type[Section]:
+    """The keys that the base class of a device applies; none for a stage."""
+    if issubclass(made_by, Camera):
+        return CameraOrientation
+    return MirrorOrientation if issubclass(made_by, DeformableMirror) else Section
+
+
+def _require_arguments(driver: str, made_by: type[Device], settings: Mapping[str, Any]) -> None:
+    """Refuse settings without a keyword that the driver needs."""
+    for name, parameter in inspect.signature(made_by).parameters.items():
+        is_needed = parameter.default is parameter.empty and parameter.kind not in (
+            parameter.VAR_POSITIONAL,
+            parameter.VAR_KEYWORD,
+        )
+        if is_needed and name not in settings:
+            option = "--serial NUMBER" if name == "serial" else f"--set {name}=..."
+            raise ConfigError(
+                f"driver '{driver}' needs {name}, which is missing; give {name}=..., on the command line "
+                f"{option}"
+            )
+
+
+def _parse_limits(where: str, limits: object) -> MirrorLimits | None:
+    """Limits, or a table of those that differ from the cautious ones; ``None``: those of the driver."""
+    if limits is None or isinstance(limits, MirrorLimits):
+        return limits
+    if not isinstance(limits, Mapping):
+        raise ConfigError(
+            f"{where}: {limits!r}  must be a table, such as {{'max_stroke': 0.3}}, on the command line "
+            "--set limits.max_stroke=0.3"
+        )
+    return parse_options(LimitsConfig, where, {**asdict(CAUTIOUS_LIMITS), **limits}).to_limits()
+
+
+def _order_of(driver: str, mirror: DeformableMirror, order: str) -> NDArray[np.intp] | None:
+    """Number in the layout of each actuator of the hardware ``(n_act,)``; ``None``: the same."""
+    if order == "none":
+        return None
+    try:
+        return hardware_order(order, _positions_in_pitches(mirror, order))
+    except ValueError as error:
+        raise ConfigError(f"{driver}.order: {order!r}  {error}") from None
+
+
+def _positions_in_pitches(mirror: DeformableMirror, order: str) -> NDArray[np.float64]:
+    """Positions of the actuators ``(n_act, 2)`` before the mirror is opened; ``ValueError`` if not known."""
+    if order.startswith("numbers:"):
+        # Needs no positions; opening the mirror compares how many there are.
+        return np.zeros((order.count(",") + 1, 2))
+    try:
+        positions = mirror.info.positions_m
+    except NotOpen:
+        raise ValueError("needs the arrangement of the actuators; give layout") from None
+    pairs = nearest_pairs(positions)
+    pitch = np.median(np.hypot(*(positions[pairs[:, 0]] - positions[pairs[:, 1]]).T))
+    return np.asarray(positions / pitch)
 
 
 def open_device(driver: str, /, **settings: Any) -> Any:
@@ -305,7 +381,8 @@ def open_device(driver: str, /, **settings: Any) -> Any:
         Name of a driver, such as ``"alpao"``, ``"ximea"``, ``"pi-e727"`` or ``"asm"``.
     **settings
         Keywords of the driver's class: ``serial``, the options on the page of the device, and ``limits``, all
-        (``MirrorLimits``) or a table of those that differ.
+        (``MirrorLimits``) or a table of those that differ. Also ``order`` and ``polarity`` of a mirror, and
+        ``flip`` of a camera, as in a system file.
 
     Returns
     -------

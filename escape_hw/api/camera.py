@@ -149,6 +149,11 @@ class Camera(Device):
             The settings are outside the range of the device; the message gives the range.
         """
         self.require_open()
+        self._require_valid(want)
+        return self._check(want)
+
+    def _require_valid(self, want: CameraSettings) -> None:
+        """Refuse settings that no camera with this sensor has, as :meth:`check`; ``info`` must be known."""
         rows, columns = self.info.sensor_shape
         region = want.region
         if not all(isinstance(v, int | np.integer) for v in astuple(region)):
@@ -173,7 +178,6 @@ class Camera(Device):
                 )
         if not math.isfinite(want.gain_db):
             raise SettingRejected(self.name, f"gain_db is {want.gain_db}; it must be finite")
-        return self._check(want)
 
     @final
     def configure(self, want: CameraSettings) -> CameraSettings:

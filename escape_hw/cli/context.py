@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import logging
 import os
 import signal
 import sys
@@ -121,8 +120,6 @@ class InterruptHandler:
             raise KeyboardInterrupt
 
 
-log = logging.getLogger(__name__)
-
 _PIPE_WIDTH = 120
 #: Exit codes; the same for every command.
 DONE, FAILED, USAGE, FAULT, ABORTED = 0, 1, 2, 3, 130
@@ -140,6 +137,7 @@ class CommandContext:
         self.interrupts = InterruptHandler(self._notify_from_signal_handler)
         self.folder: RunFolder | None = None
         self._subject: dict[str, Any] = {"system": None, "simulated": None, "seed": None}
+        self._device: dict[str, Any] = {}
         self.devices_opened = False
         self.code = DONE
         self._document: Mapping[str, Any] | None = None
@@ -179,11 +177,12 @@ class CommandContext:
     def report(self, met: bool = True, **content: Any) -> None:
         """Set the document of a command without a run: its header, and this content.
 
-        The header has system, mode and seed as loaded, unless ``content`` has others.
+        The header has system, mode and seed as loaded, and driver and serial number of a command for one
+        device, unless ``content`` has others.
         """
         from escape_hw.io.documents import header_fields
 
-        self.result({**header_fields(self.command, **self._subject), **content}, met)
+        self.result({**header_fields(self.command, **self._subject), **self._device, **content}, met)
 
     def load_config(self, selection: SystemSelection) -> SystemConfig:
         """The configuration of the selected system; error documents then have its name, mode and seed."""
@@ -203,6 +202,10 @@ class CommandContext:
     def set_subject(self, system: str | None, simulated: bool | None, seed: int | None) -> None:
         """Set system, mode and seed for error documents, as far as they are known."""
         self._subject = {"system": system, "simulated": simulated, "seed": seed}
+
+    def set_device(self, driver: str, serial: str) -> None:
+        """Set the one device that the command is for; it is named in documents, also of errors."""
+        self._device = {"driver": driver, "serial": serial}
 
     def run(self, procedure: Procedure[T]) -> T:
         """Run a procedure and show its progress; Ctrl-C aborts it.
@@ -408,8 +411,6 @@ def command_context(command: str, *, json: bool = False, quiet: bool = False) ->
         except (EscapeError, KeyboardInterrupt) as error:
             context.code = context.fail(error)
         except Exception as error:
-            if not _is_file_error(error):
-                log.exception("unexpected")
             context.code = context.fail(error)
     context.print_document()
     raise typer.Exit(context.code)

@@ -51,6 +51,14 @@ class SystemSelection:
         """The selection with further overrides, applied last."""
         return replace(self, set=(*self.set, *overrides))
 
+    def words(self) -> tuple[str, ...]:
+        """The selection as words of a command line."""
+        options = [("--driver", self.driver), ("--serial", self.serial)]
+        options += [("--set", change) for change in self.set]
+        options += [("--seed", "" if self.seed is None else str(self.seed)), ("--mode", self.mode or "")]
+        given = (word for option, value in options if value for word in (option, value))
+        return (self.system, *given) if self.system else tuple(given)
+
 
 #: A command's system, named by its argument; see :func:`~escape_hw.cli.command.command`.
 Selection = Annotated[

@@ -137,8 +137,17 @@ class StageConfig(Section):
 
 
 Mode = Literal["sim", "hardware"]
+#: Sign of a mirror.
+Polarity = Literal[-1, 1]
 Pixels = Annotated[int, Field(ge=0, le=16384)]
 Size = Annotated[int, Field(ge=1, le=16384)]
+#: Width and height of a sensor; x, y, width and height of a region.
+SensorSize = TomlArray[tuple[Size, Size]]
+RegionNumbers = TomlArray[tuple[Pixels, Pixels, Size, Size]]
+BitDepth = Annotated[int, Field(ge=8, le=16)]
+ExposureTime = Annotated[float, Field(ge=1e-6, le=60)]
+FrameRate = Annotated[float, Field(ge=0.01, le=20000)]
+Gain = Annotated[float, Field(ge=0, le=48)]
 
 
 class DeviceConfig(Section):
@@ -200,6 +209,47 @@ def mirror_info(
     )
 
 
+def hardware_order(order: str, positions: NDArray[np.float64]) -> NDArray[np.intp] | None:
+    """Number in the layout of each actuator of the hardware ``(n_act,)``; ``None``: the same.
+
+    Parameters
+    ----------
+    order
+        As in ``devices.dm.order``.
+    positions
+        Positions of the actuators in the layout ``(n_act, 2)``, pitches.
+
+    Raises
+    ------
+    ValueError
+        The order does not fit the layout.
+    """
+    import numpy as np
+
+    if order == "none":
+        return None
+    for flip in FLIPS:
+        if order == flip:
+            return flip_order(positions, flip)
+    numbers = np.array([int(number) for number in order.removeprefix("numbers:").split(",")], np.intp)
+    if not np.array_equal(np.sort(numbers), np.arange(len(positions))):
+        raise ValueError(f"has {numbers.size} numbers; it needs each of 0 to {len(positions) - 1} once")
+    return numbers
+
+
+class MirrorOrientation(Section):
+    """Keys of a mirror's section that its base class applies, for a mirror that is used alone."""
+
+    order: OrderText = "none"
+    polarity: Polarity = 1
+
+
+class CameraOrientation(Section):
+    """As :class:`MirrorOrientation`, for a camera."""
+
+    flip: Flip = "none"
+
+
 class MirrorConfig(DeviceConfig):
     """Deformable mirror: nominal geometry and limits."""
 
@@ -214,7 +264,7 @@ class MirrorConfig(DeviceConfig):
         description="numbering of the actuators in the hardware: a flip that makes its map of numbers that "
         f"of the layout, or the layout's number of each: {ORDERS}",
     )
-    polarity: Literal[-1, 1] = Field(1, description="-1: a positive command shortens the optical path")
+    polarity: Polarity = Field(1, description="-1: a positive command shortens the optical path")
     pitch_m: float = Field(gt=0, le=1, description="distance between actuators on the mirror, metres")
     pitches_across_pupil: float = Field(
         gt=0, le=200, description="actuator pitches across the diameter of the pupil"
@@ -277,30 +327,14 @@ class MirrorConfig(DeviceConfig):
         return layouts.positions(self.layout) * in_pitches[self.position_unit]
 
     def hardware_order(self, order: str | None = None) -> NDArray[np.intp] | None:
-        """Number in the layout of each actuator of the hardware ``(n_act,)``; ``None``: the same.
+        """As :func:`hardware_order`, in this layout.
 
         Parameters
         ----------
         order
             By default the key of the same name.
-
-        Raises
-        ------
-        ValueError
-            It does not fit the layout.
         """
-        import numpy as np
-
-        order = self.order if order is None else order
-        if order == "none":
-            return None
-        for flip in FLIPS:
-            if order == flip:
-                return flip_order(self.positions(), flip)
-        numbers = np.array([int(number) for number in order.removeprefix("numbers:").split(",")], np.intp)
-        if not np.array_equal(np.sort(numbers), np.arange(self.n_act)):
-            raise ValueError(f"has {numbers.size} numbers; it needs each of 0 to {self.n_act - 1} once")
-        return numbers
+        return hardware_order(self.order if order is None else order, self.positions())
 
     def layout_in_pitches(self) -> str:
         """The layout; a table of positions in pitches, whatever its unit."""
@@ -339,24 +373,28 @@ class MirrorConfig(DeviceConfig):
         return self
 
 
+def exposure_violations(exposure_s: float, frame_rate_hz: float) -> list[RuleViolation]:
+    """What is wrong with an exposure (seconds) at a frame rate (hertz)."""
+    if exposure_s * frame_rate_hz <= 1:
+        return []
+    text = f"longer than a frame ({1 / frame_rate_hz:.4g} s at {frame_rate_hz:g} Hz)"
+    return [RuleViolation("exposure_s", exposure_s, text)]
+
+
 class CameraConfig(DeviceConfig):
     """A camera."""
 
-    sensor_px: TomlArray[tuple[Size, Size]] = Field(
-        description="width and height of the sensor after binning, pixels"
-    )
-    region: TomlArray[tuple[Pixels, Pixels, Size, Size]] = Field(
-        description="region: x, y, width, height, pixels"
-    )
+    sensor_px: SensorSize = Field(description="width and height of the sensor after binning, pixels")
+    region: RegionNumbers = Field(description="region: x, y, width, height, pixels")
     flip: Flip = Field(
         "none",
         description="how images are turned before they are used; turn-90 is from +x (columns) to +y (rows); "
         "region and sensor_px are those before",
     )
-    bit_depth: int = Field(ge=8, le=16, description="bits per pixel")
-    exposure_s: float = Field(ge=1e-6, le=60, description="exposure time, seconds")
-    frame_rate_hz: float = Field(ge=0.01, le=20000, description="frames per second, hertz")
-    gain_db: float = Field(0.0, ge=0, le=48, description="analogue gain, decibels")
+    bit_depth: BitDepth = Field(description="bits per pixel")
+    exposure_s: ExposureTime = Field(description="exposure time, seconds")
+    frame_rate_hz: FrameRate = Field(description="frames per second, hertz")
+    gain_db: Gain = Field(0.0, description="analogue gain, decibels")
     timeout_s: float = Field(1.0, gt=0, le=120, description="longest wait for a frame, seconds")
 
     def settings(self) -> CameraSettings:
@@ -374,10 +412,7 @@ class CameraConfig(DeviceConfig):
         if width != height and exchanges_axes(self.flip):
             text = f"exchanges rows and columns; needs a square region, not {width} x {height} pixels"
             violations.append(RuleViolation("flip", self.flip, text))
-        if self.exposure_s * self.frame_rate_hz > 1:
-            text = f"longer than a frame ({1 / self.frame_rate_hz:.4g} s at {self.frame_rate_hz:g} Hz)"
-            violations.append(RuleViolation("exposure_s", self.exposure_s, text))
-        raise_violations(violations)
+        raise_violations([*violations, *exposure_violations(self.exposure_s, self.frame_rate_hz)])
         return self
 
 
@@ -405,6 +440,10 @@ class ScienceConfig(CameraConfig):
     )
 
 
+#: Largest tilt of a mirror from its centre, radians.
+LargestTilt = Annotated[float, Field(gt=0, le=0.1)]
+
+
 class ModulatorConfig(DeviceConfig):
     """The tip-tilt stage that modulates the beam on a pyramid."""
 
@@ -420,9 +459,7 @@ class ModulatorConfig(DeviceConfig):
         description="mirror tilt that moves the beam by 1 lambda/D on the pyramid, radians; absent: "
         "wavelength / (2 beam_m)",
     )
-    max_tilt_rad: float = Field(
-        gt=0, le=0.1, description="largest tilt of the mirror from its centre, radians"
-    )
+    max_tilt_rad: LargestTilt = Field(description="largest tilt of the mirror from its centre, radians")
     wire: WireConfig = Field(default_factory=WireConfig, description="connection of the real controller")
     stage: StageConfig = Field(default_factory=StageConfig, description="axes of the real stage")
 

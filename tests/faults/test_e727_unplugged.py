@@ -102,7 +102,7 @@ def test_usb_in_use_is_reported():
         (
             None,
             "4711",
-            r"0 controllers match USB 1a72:\* 4711 \(there: SIMMOD\); set devices\.modulator\.serial",
+            r"0 controllers match USB 1a72:\* 4711 \(there: SIMMOD\); correct serial",
         ),
         (0x9999, "", r"0 controllers match USB 1a72:9999 \(there: none of this vendor\)"),
     ],

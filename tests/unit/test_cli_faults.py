@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import pytest
+import typer
+
+from escape_hw.cli.context import command_context
 from escape_hw.errors import CalibrationError, DeviceLost
 
 
@@ -32,6 +36,14 @@ def test_defect_exits_3_with_its_traceback_in_the_log(document, bench, tmp_path)
     assert "run.log" in err
     assert "Traceback" not in err
     assert "Traceback" in (tmp_path / "run" / "run.log").read_text()
+
+
+def test_the_traceback_of_a_defect_is_printed_once(capsys, caplog):
+    with pytest.raises(typer.Exit) as ended, command_context("dm flat"):
+        1 // 0  # noqa: B018
+    assert ended.value.exit_code == 1
+    assert capsys.readouterr().err.count("Traceback") == 1
+    assert not caplog.records, "without a handler, Python prints them as well"
 
 
 def test_disk_full_at_the_end_exits_1_after_the_mirror_is_safe(document, bench, tmp_path, monkeypatch):

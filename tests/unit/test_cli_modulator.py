@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shlex
+
 import pytest
 
 from escape_hw.api.emulator import EmulatorRequest
@@ -65,6 +67,35 @@ def test_start_status_stop_on_the_wire(document, escape, stage):
     assert (found["modulation"], found["left"]) == (None, "parked")
     assert emulator.controller.state.describe() == "at rest"
     assert emulator.violations == ()
+
+
+def test_a_stage_without_a_system_is_stopped_by_the_command_that_is_printed(escape, document, stage):
+    emulator, _ = stage
+    words = ["--driver", "pi-e727", "--serial", "SIMMOD", "--set", "host=127.0.0.1"]
+    words += ["--set", f"port={emulator.server.port}", "--set", "stage.axes=['1', '2']"]
+    circle = ["--radius-rad", 1.4e-4, "--frequency", 303.0]
+    code, _, err = escape("modulator", "start", *words[:2], *words[4:], *circle)
+    assert (code, "needs serial, which is missing" in err, "--serial NUMBER" in err) == (2, True, True)
+    assert emulator.controller.state.describe() == "at rest"
+    code, out, err = escape("modulator", "start", *words, *circle)
+    assert code == 0, err
+    assert "this changes hardware, pi-e727 SIMMOD: servos on" in err
+    assert emulator.controller.state.describe() == "turning"
+    printed = shlex.split(out.partition("stop it with: ")[2].splitlines()[0])
+    assert printed == ["escape", "modulator", "stop", *words]
+    code, found, _ = document(*printed[1:])
+    assert (code, found["driver"], found["serial"], found["left"]) == (0, "pi-e727", "SIMMOD", "parked")
+    assert emulator.controller.state.describe() == "at rest"
+
+
+def test_a_stage_of_a_system_is_stopped_by_the_command_that_is_printed(escape, stage):
+    emulator, here = stage
+    code, out, err = escape("modulator", "start", "razor-pywfs", *here)
+    assert code == 0, err
+    printed = shlex.split(out.partition("stop it with: ")[2].splitlines()[0])
+    assert printed == ["escape", "modulator", "stop", "razor-pywfs", *here]
+    assert escape(*printed[1:])[0] == 0
+    assert emulator.controller.state.describe() == "at rest"
 
 
 def test_for_some_seconds_and_then_parked(document, stage):

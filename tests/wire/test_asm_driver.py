@@ -137,7 +137,7 @@ def test_every_call_of_a_session_arrives_in_order() -> None:
 def test_disabled_actuators_are_reported_and_never_driven() -> None:
     off = [7, 259, 260, 261, 262, 263, 319, 320, 321, 322, 323]
     with emulator() as made, driver(port_of(made), f"devices.dm.limits.disabled={off}") as mirror:
-        assert made.server.calls[0] == ("SET_DISABLED", (tuple(off), "devices.dm.limits.disabled"))
+        assert made.server.calls[0] == ("SET_DISABLED", (tuple(off), "limits.disabled"))
         report = mirror.send(np.full(336, 0.01))
         assert report.guard.disabled == 11
         name, what = made.server.calls[-1]
@@ -210,7 +210,7 @@ def test_too_many_skipped_commands_in_a_row_are_an_error() -> None:
             made.inject("skip")
         for _ in range(2):
             assert mirror.send(np.zeros(336)).skipped
-        with pytest.raises(DeviceError, match=r"skipped 3 commands in a row .* lower max_slew"):
+        with pytest.raises(DeviceError, match=r"skipped 3 commands in a row .* lower limits.max_slew"):
             mirror.send(np.zeros(336))
 
 
@@ -248,7 +248,7 @@ def test_many_may_observe_while_one_controls() -> None:
 
 def test_another_serial_number_is_refused() -> None:
     with emulator() as made:
-        with pytest.raises(DeviceError, match=r"is 'SIM336', not 'MMT336'; correct devices.dm.serial"):
+        with pytest.raises(DeviceError, match=r"is 'SIM336', not 'MMT336'; correct serial or the address"):
             driver(port_of(made), "devices.dm.serial=MMT336").observe_health()
         assert made.violations == ()
 

@@ -29,6 +29,35 @@ def test_a_mirror_is_moved_by_its_driver(document) -> None:
     assert not stand_in("asdk").violations
 
 
+def test_documents_name_the_device(document) -> None:
+    words = alpao_words()
+    lower = [word.lower() if word == "BAX118" else word for word in words]
+    for verb, rest in (("flat", []), ("poke", [48, 0.05, "--seconds", 0]), ("status", [])):
+        code, found, _ = document("dm", verb, *lower, *rest)
+        assert (code, found["driver"], found["serial"]) == (0, "alpao", "BAX118"), "the name of the SDK"
+    # Wherever the number comes from, and if nothing was opened.
+    code, found, err = document("dm", "flat", *words[:2], *words[4:], "--set", "serial=BAX118")
+    assert (code, found["serial"], "this changes hardware, alpao BAX118: " in err) == (0, "BAX118", True)
+    for wrong in (["--set", "polarity=2"], ["--set", "layout=square-3"]):
+        code, found, _ = document("dm", "flat", *words, *wrong)
+        assert (code in (2, 3), found["driver"], found["serial"]) == (True, "alpao", "BAX118")
+        assert found["error"]["message"]
+    code, found, _ = document("dm", "flat", "razor-shwfs")
+    assert (code, found["driver"], found["serial"]) == (0, "sim-alpao", "SIM97")
+
+
+def test_messages_name_the_keywords_of_a_device_used_alone(escape) -> None:
+    code, _, err = escape("dm", "flat", *alpao_words(), "--set", "layout=square-3")
+    assert (code, "correct layout or serial" in err, "devices." in err) == (3, True, False)
+    with emulator() as made:
+        where = ["--set", f"port={port_of(made)}"]
+        code, _, err = escape("dm", "flat", "--driver", "asm", "--serial", "OTHER", *where)
+        assert (code, "correct serial or the address" in err, "devices." in err) == (3, True, False)
+        wrong = [*where, "--set", "limits.max_slew=2.0"]
+        code, _, err = escape("dm", "flat", "--driver", "asm", "--serial", "SIM336", *wrong)
+        assert (code, "asm: limits.max_slew is 2" in err, "devices." in err) == (3, True, False)
+
+
 def test_a_mirror_of_an_unknown_arrangement_is_flattened_and_poked(escape, caplog) -> None:
     words = alpao_words()
     stand_in("asdk").script("set actuators 192")
@@ -49,7 +78,8 @@ def test_a_mirror_of_an_unknown_arrangement_is_flattened_and_poked(escape, caplo
         (["poke", "97", "0.1"], 3, "actuator 97 does not exist; the mirror has 0 to 96"),
         (["poke", "0", "0.6"], 3, "a poke of 0.6 at actuator 0 is beyond its limits"),
         (["flat", "--mode", "sim"], 2, "not with --driver"),
-        (["flat", "--set", "limits.max_stroke=2"], 2, "max_stroke is 2; it must lie in"),
+        (["flat", "--set", "limits.max_stroke=2"], 2, "alpao.limits.max_stroke: 2  is out of range"),
+        (["flat", "--set", "limits=5"], 2, "alpao.limits: 5  must be a table"),
         (["flat", "--set", "trigger_in=up"], 2, "alpao.trigger_in: 'up'  must be"),
         (["flat", "razor-shwfs"], 2, "unexpected extra argument"),
     ],
@@ -86,7 +116,7 @@ def test_a_camera_is_read_by_its_driver(document, tmp_path) -> None:
 
 @pytest.mark.usefixtures("short_auto_zero")
 def test_a_stage_is_turned_by_its_driver(document, escape) -> None:
-    words = ["--driver", "pi-e727", "--set", "kind=emulator"]
+    words = ["--driver", "pi-e727", "--serial", "0123456789", "--set", "kind=emulator"]
     circle = ["--radius-rad", 1.4e-4, "--frequency", 303.0, "--seconds", 0]
     code, found, _ = document("modulator", "start", *words, *circle)
     assert (code, found["left"], found["asked"]["radius_rad"]) == (0, "parked", 1.4e-4)

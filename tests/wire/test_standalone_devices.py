@@ -12,6 +12,7 @@ from driver_bench import fresh, stand_in
 
 import escape_hw
 from escape_drivers.alpao import AlpaoMirror
+from escape_drivers.aravis import AravisCamera
 from escape_drivers.asm import AsmMirror
 from escape_drivers.common.options import known_layout
 from escape_drivers.pi import PiModulator
@@ -37,7 +38,7 @@ def camera(**settings) -> XimeaCamera:
 
 
 def stage(**settings) -> PiModulator:
-    return PiModulator(kind="emulator", **settings)
+    return PiModulator(serial=123456789, kind="emulator", **settings)
 
 
 @parametrize_device_checks({"alpao": mirror, "ximea": camera, "pi-e727": stage})
@@ -51,7 +52,7 @@ def test_a_mirror_takes_its_geometry_from_the_sdk() -> None:
     with pytest.raises(NotOpen, match="number of actuators is known once it is open"):
         dm.info  # noqa: B018
     with dm:
-        assert (dm.info.n_act, dm.info.serial, dm.info.simulated) == (97, "bax118", True)
+        assert (dm.info.n_act, dm.info.serial, dm.info.simulated) == (97, "BAX118", True)
         assert dm.info.layout is not None
         assert dm.info.layout.shape == (11, 11)
         assert np.ptp(dm.info.positions_m[:, 0]) == pytest.approx(10 * 1.5e-3)
@@ -113,12 +114,14 @@ def test_the_guard_limits_every_command_of_a_mirror_used_alone() -> None:
 def test_settings_of_a_device_used_alone_are_checked() -> None:
     with pytest.raises(ConfigError, match=r"^alpao\.triger_in: unknown option \(did you mean 'trigger_in'\?"):
         mirror(triger_in="off")
+    with pytest.raises(ConfigError, match=r"did you mean 'stroke_m'. there are: serial, .*layout, pitch_m,"):
+        mirror(strok_m=1e-6)
     with pytest.raises(ConfigError, match="by its serial number only"):
         AlpaoMirror(serial=" ")
     with pytest.raises(ConfigError, match=r"ximea\.queue: 0  is out of range"):
         camera(queue=0)
     with pytest.raises(ConfigError, match=r"modulator\.port: 0  is out of range"):
-        PiModulator(host="10.0.0.1", port=0)
+        PiModulator(serial="1", host="10.0.0.1", port=0)
 
 
 def test_a_camera_takes_the_size_of_its_sensor_from_the_library() -> None:
@@ -127,10 +130,70 @@ def test_a_camera_takes_the_size_of_its_sensor_from_the_library() -> None:
         assert rows > 0
         assert device.settings.region == escape_hw.Region(0, 0, columns, rows)
         assert device.next_frame(5.0).data.shape == (rows, columns)
-    with camera(region=(16, 8, 64, 32), exposure_s=2e-4, frame_rate_hz=100.0) as device:
+    with camera(region=np.array([16, 8, 64, 32]), exposure_s=2e-4, frame_rate_hz=100.0) as device:
         assert device.next_frame(5.0).data.shape == (32, 64)
     with pytest.raises(DeviceError, match="sensor_px is 5 x 5"):
         camera(sensor_px=(5, 5)).open()
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"region": (-16, 0, 64, 64)}, "ximea.region.0.: -16  must be greater than or equal to 0"),
+        ({"region": (0, 0, 64)}, "ximea.region: .0, 0, 64.  has too few items"),
+        ({"exposure_s": -1}, "ximea.exposure_s: -1  is out of range .allowed range 1e-06 <= x <= 60"),
+        ({"exposure_s": math.nan}, "ximea.exposure_s: nan  must be a finite number"),
+        ({"exposure_s": "1e-3"}, "ximea.exposure_s: '1e-3'  must be a valid number"),
+        ({"exposure_s": 0.5}, "ximea.exposure_s: 0.5  longer than a frame .0.1 s at 10 Hz"),
+        ({"frame_rate_hz": 0}, "ximea.frame_rate_hz: 0  is out of range"),
+        ({"bit_depth": 99}, "ximea.bit_depth: 99  is out of range .allowed range 8 <= x <= 16"),
+        ({"exposure": 1e-3}, "unknown option .did you mean 'exposure_s'. there are: .* bit_depth, .*queue"),
+        ({"frame_rate": 10.0}, "unknown option .did you mean 'frame_rate_hz'"),
+    ],
+)
+def test_settings_of_a_camera_are_those_of_a_system_file(wrong, message) -> None:
+    with pytest.raises(ConfigError, match=message):
+        camera(**wrong)
+
+
+def test_a_region_off_the_sensor_is_refused() -> None:
+    device = camera(region=(1200, 900, 400, 400))
+    with pytest.raises(SettingRejected, match="does not lie on the sensor of 1280 x 1024 pixels"):
+        device.open()
+    assert not device.is_open
+    assert not stand_in("m3api").violations
+    fresh("aravis", "set serial 17")
+    device = AravisCamera(serial=17, region=(0, 500, 64, 64), library=str(stand_in("aravis").path))
+    with pytest.raises(SettingRejected, match="does not lie on the sensor of 720 x 540 pixels"):
+        device.open()
+
+
+def test_serial_numbers_may_be_whole_numbers() -> None:
+    fresh("m3api", "set serial 12345678")
+    with XimeaCamera(serial=12345678, library=str(stand_in("m3api").path)) as device:
+        assert device.info.serial == "12345678"
+    with stage() as device:
+        assert device.info.serial == "123456789"
+    for wrong in (None, 1.5, True):
+        with pytest.raises(ConfigError, match=f"^serial: {wrong}  must be text or a whole number"):
+            PiModulator(serial=wrong)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"serial": ""}, "serial: ''  a real device is opened by its serial number only"),
+        ({"max_tilt_rad": -1}, "modulator.max_tilt_rad: -1  is out of range .allowed range 0 < x <= 0.1"),
+        ({"max_tilt_rad": "1e-3"}, "modulator.max_tilt_rad: '1e-3'  must be a valid number"),
+        ({"max_tilt": 1e-3}, "modulator.max_tilt: unknown option .did you mean 'max_tilt_rad'"),
+        ({"stage": {"axes": ["1", "1"]}}, "modulator.stage.axes: .'1', '1'.  the two axes must differ"),
+        ({"stage": {"axis": ["1", "2"]}}, "modulator.stage.axis: unknown option .did you mean 'axes'"),
+        ({"stage": 5}, "modulator.stage: 5  must be"),
+    ],
+)
+def test_settings_of_a_stage_are_checked(wrong, message) -> None:
+    with pytest.raises(ConfigError, match=message):
+        PiModulator(**{"serial": "1", "kind": "emulator", **wrong})
 
 
 def test_a_stage_is_limited_to_a_small_tilt() -> None:
@@ -166,10 +229,14 @@ def test_a_device_is_opened_by_the_name_of_its_driver() -> None:
     with escape_hw.open_device("alpao", serial="BAX118", library=path) as dm:
         assert isinstance(dm, AlpaoMirror)
         assert dm.is_open
-    with pytest.raises(
-        ConfigError, match=r"driver 'alpao' cannot be created: .*AlpaoMirror failed with TypeErr"
+    for driver, missing, option in (
+        ("alpao", "serial", "--serial NUMBER"),
+        ("pi-e727", "serial", "--serial NUMBER"),
+        ("pyrtc-camera", "stream", "--set stream=..."),
     ):
-        escape_hw.open_device("alpao")
+        text = f"driver '{driver}' needs {missing}, which is missing; .* {option}"
+        with pytest.raises(ConfigError, match=text):
+            escape_hw.open_device(driver)
     with pytest.raises(ConfigError, match="'sim-alpao' works as a part of a system only"):
         escape_hw.open_device("sim-alpao")
 
@@ -179,6 +246,46 @@ def test_limits_of_a_device_used_alone_may_be_a_table() -> None:
     words = {"serial": "BAX118", "library": str(stand_in("asdk").path)}
     with escape_hw.open_device("alpao", limits={"max_stroke": 0.3}, **words) as dm:
         assert dm.limits == replace(CAUTIOUS_LIMITS, max_stroke=0.3)
-    for wrong in ({"max_stork": 0.3}, {"max_stroke": 3}):
-        with pytest.raises(ConfigError, match="driver 'alpao': limits: "):
+    with escape_hw.open_device("alpao", limits={"disabled": tuple(np.arange(2))}, **words) as dm:
+        assert dm.limits == replace(CAUTIOUS_LIMITS, disabled=(0, 1))
+    for wrong, message in (
+        ({"max_stork": 0.3}, "alpao.limits.max_stork: unknown option .did you mean 'max_stroke'"),
+        ({"max_stroke": 3}, "alpao.limits.max_stroke: 3  is out of range"),
+        (5, "alpao.limits: 5  must be a table, .* --set limits.max_stroke=0.3"),
+    ):
+        with pytest.raises(ConfigError, match=message):
             escape_hw.open_device("alpao", limits=wrong, **words)
+
+
+def test_numbering_sign_and_flip_are_given_as_in_a_system_file() -> None:
+    fresh("asdk", "set serial BAX118")
+    words = {"serial": "BAX118", "library": str(stand_in("asdk").path)}
+    order = load_system("razor-shwfs").devices.dm.hardware_order("left-right")
+    for numbering in (
+        {"order": "left-right", "layout": "circle-11"},
+        {"order": f"numbers:{','.join(map(str, order))}"},
+    ):
+        with escape_hw.open_device("alpao", polarity=-1, **numbering, **words) as dm:
+            shape = dm.flat
+            shape[order[0]] = 0.1
+            dm.send(shape)
+            assert stand_in("asdk").shape(97)[0] == -0.1
+    for wrong, message in (
+        ({"polarity": 2}, "alpao.polarity: 2  must be -1 or 1"),
+        ({"order": "left-right"}, "alpao.order: 'left-right'  needs the arrangement .*; give layout"),
+        ({"order": "left-right", "layout": "points:0,0;1,0;5,0"}, "does not map onto itself"),
+        ({"flip": "left-right"}, "alpao.flip: unknown option"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            escape_hw.open_device("alpao", **wrong, **words)
+    fresh("m3api", "set serial 12345678")
+    words = {"serial": 12345678, "library": str(stand_in("m3api").path), "frame_rate_hz": 100.0}
+    region = {"region": (16, 8, 64, 64)}
+    with escape_hw.open_device("ximea", **region, **words) as device:
+        plain = device.next_frame(5.0).data
+    with escape_hw.open_device("ximea", flip="transpose", **region, **words) as device:
+        assert np.array_equal(device.next_frame(5.0).data, plain.T)
+    with pytest.raises(SettingRejected, match="must be square, since flip"):
+        escape_hw.open_device("ximea", flip="turn-90", **words)
+    with pytest.raises(ConfigError, match=r"ximea\.flip: 'x'  must be 'none'"):
+        escape_hw.open_device("ximea", flip="x", **words)

@@ -16,10 +16,11 @@ import pytest
 from streams import PERIOD_S, SHAPE, camera_config, create, mirror_config, published, ramp
 
 from escape_drivers.streams import camera as stream_camera
+from escape_hw.bench import open_device
 from escape_hw.config.loader import load_system
 from escape_hw.config.registry import DeviceContext, device_factory
 from escape_hw.config.system import SystemConfig
-from escape_hw.errors import ConfigError, DeviceError, FrameTimeout
+from escape_hw.errors import ConfigError, DeviceError, FrameTimeout, SettingRejected
 from escape_hw.io.interchange.milk.stream import MilkStream
 from escape_hw.io.interchange.pyrtc.stream import ShmemStream
 from escape_hw.io.interchange.stream import Publication
@@ -104,6 +105,14 @@ def test_frames_are_those_written_and_gaps_are_counted(kind: str) -> None:
         assert camera.status().lost == second.index - first.index - 1 > 0
         assert camera.info.serial == f"stream {TAG}_camera"
         assert not camera.info.simulated
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_region_off_the_stream_is_refused(kind: str) -> None:
+    width, height = SHAPE[::-1]
+    region = (width - 8, 0, 16, height)
+    with pytest.raises(SettingRejected, match=f"does not lie on the sensor of {width} x {height} pixels"):
+        open_device(f"{kind}-camera", stream=f"{TAG}_camera", region=region)
 
 
 @pytest.mark.parametrize("kind", KINDS)

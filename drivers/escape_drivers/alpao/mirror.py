@@ -16,15 +16,16 @@ from pydantic import Field
 
 from escape_drivers.alpao.library import AlpaoLibrary, format_version
 from escape_drivers.common.options import (
+    keywords_of,
     known_layout,
     mirror_settings,
-    parse_options,
     require_serial,
     section_options,
 )
 from escape_hw.api.mirror import DeformableMirror, DMInfo
 from escape_hw.config.devices import mirror_info
 from escape_hw.config.layouts import n_actuators, shorten
+from escape_hw.config.options import parse_options
 from escape_hw.config.section import Section
 from escape_hw.errors import CommandRejected, DeviceError, DeviceLost, NotOpen
 from escape_hw.safety.limits import CAUTIOUS_LIMITS, MirrorLimits
@@ -116,7 +117,7 @@ class AlpaoMirror(DeformableMirror):
 
     def __init__(
         self,
-        serial: str,
+        serial: str | int,
         *,
         name: str = "alpao",
         layout: str = "",
@@ -127,8 +128,9 @@ class AlpaoMirror(DeformableMirror):
     ) -> None:
         super().__init__(name, limits)
         self._serial, self._options = (
-            require_serial("serial", serial),
-            parse_options(AlpaoOptions, name, options),
+            # Configuration files have names in capitals, and the SDK searches for capitals.
+            require_serial("serial", serial).upper(),
+            parse_options(AlpaoOptions, name, options, keywords_of(type(self))),
         )
         self._layout, self._pitch_m, self._stroke_m = layout, pitch_m, stroke_m
         self._buffer = np.empty(0)
@@ -217,8 +219,7 @@ class AlpaoMirror(DeformableMirror):
         if self._options.config_folder:
             os.environ[_CONFIG_VARIABLE] = self._options.config_folder
         library = self._library = AlpaoLibrary(self.name, self._options.library)
-        # Configuration files have names in capitals, and the SDK searches for capitals.
-        handle = self._handle = library.init(self._serial.upper())
+        handle = self._handle = library.init(self._serial)
         n_act = round(library.get(handle, "NbOfActuator"))
         layout = self._layout or known_layout(n_act)
         if not layout:
@@ -231,7 +232,7 @@ class AlpaoMirror(DeformableMirror):
             raise DeviceError(
                 self.name,
                 f"has {n_act} actuators, but the layout {shorten(layout)!r} has {wanted}; "
-                f"correct devices.{self.name}.layout or the serial number",
+                "correct layout or serial",
             )
         version = format_version(library.get(handle, "VersionInfo"))
         log.info("%s: SDK %s, mirror %s", self.name, version, self._serial)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ctypes
 import logging
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Literal, Self
 
 import numpy as np
@@ -82,13 +81,14 @@ class AravisCamera(BlockingCamera[AravisLibrary]):
     Raises
     ------
     ConfigError
-        The serial number is missing or an option is wrong.
+        The serial number is missing, or a setting is unknown or wrong.
     """
 
-    def __init__(self, serial: str, *, name: str = "aravis", **settings: Any) -> None:
+    def __init__(self, serial: str | int, *, name: str = "aravis", **settings: Any) -> None:
         setup, options = split_settings(name, serial, settings, AravisOptions)
         if "bit_depth" not in settings:
-            setup = replace(setup, bit_depth=int(options.pixel_format.removeprefix("Mono")))
+            bits = int(options.pixel_format.removeprefix("Mono"))
+            setup = setup.model_copy(update={"bit_depth": bits})
         super().__init__(name, setup, "GenICam camera", _BLOCK_ID_RANGE)
         self._options = options
         self._incomplete = 0
@@ -122,7 +122,7 @@ class AravisCamera(BlockingCamera[AravisLibrary]):
         self._info = self._build_info(model, library.stand_in or self._options.interface == "Fake")
         self._is_stand_in = library.stand_in
         log.info("%s: %s, serial number %s", self.name, model, self._setup.serial)
-        self._settings = self._apply_settings(self._check(self._setup.settings((width, height))))
+        self._settings = self._apply_settings(self._check_setup())
 
     def _apply_settings(self, want: CameraSettings) -> CameraSettings:
         library, limits, region = self._require_connected(), self._require_limits(), want.region

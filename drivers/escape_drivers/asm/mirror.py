@@ -18,9 +18,9 @@ from escape_drivers.asm.link import AsmLink, MirrorRefusal
 from escape_drivers.asm.messages import Welcome
 from escape_drivers.asm.options import EMULATOR, AsmOptions
 from escape_drivers.common.options import (
+    keywords_of,
     layout_of,
     mirror_settings,
-    parse_options,
     require_serial,
     section_options,
 )
@@ -29,6 +29,7 @@ from escape_hw.api.emulator import Emulator, EmulatorRequest
 from escape_hw.api.mirror import DMInfo
 from escape_hw.config.devices import mirror_info
 from escape_hw.config.layouts import n_actuators, shorten
+from escape_hw.config.options import parse_options
 from escape_hw.config.registry import emulator_factory
 from escape_hw.errors import DeviceError, NotOpen, SettingRejected
 from escape_hw.safety.limits import CAUTIOUS_LIMITS, MirrorLimits
@@ -92,13 +93,13 @@ def require_identity(name: str, expected: ExpectedMirror, welcome: Welcome) -> N
     if welcome.last_command_m.size != n_act:
         raise DeviceError(
             name,
-            f"has {welcome.last_command_m.size} actuators, devices.{name}.layout = "
-            f"{shorten(expected.layout)!r} has {n_act}; correct the layout or the address",
+            f"has {welcome.last_command_m.size} actuators, but the layout {shorten(expected.layout)!r} has "
+            f"{n_act}; correct layout or the address",
         )
     if expected.serial != welcome.serial:
         raise DeviceError(
             name,
-            f"is {welcome.serial!r}, not {expected.serial!r}; correct devices.{name}.serial or the address",
+            f"is {welcome.serial!r}, not {expected.serial!r}; correct serial or the address",
         )
 
 
@@ -124,7 +125,7 @@ def require_compatible(name: str, limits: MirrorLimits, stroke_m: float, welcome
         if configured > reported * (1 + _ROUNDING):
             raise SettingRejected(
                 name,
-                f"devices.{name}.limits.{key} is {configured:g}; the mirror itself skips commands beyond "
+                f"limits.{key} is {configured:g}; the mirror itself skips commands beyond "
                 f"{reported:.4g}: set it to that or less",
             )
     unexpected = sorted(set(welcome.disabled) - set(limits.disabled))
@@ -132,8 +133,8 @@ def require_compatible(name: str, limits: MirrorLimits, stroke_m: float, welcome
         all_disabled = sorted({*welcome.disabled, *limits.disabled})
         raise SettingRejected(
             name,
-            f"actuators {unexpected} are out of service that the configuration counts on; put this into "
-            f"[devices.{name}.limits]: disabled = {all_disabled}",
+            f"actuators {unexpected} are out of service that the configuration counts on; set "
+            f"limits.disabled = {all_disabled}",
         )
     return () if set(limits.disabled) == set(welcome.disabled) else limits.disabled
 
@@ -175,7 +176,7 @@ class AsmMirror(AdaptiveSecondary):
 
     def __init__(
         self,
-        serial: str,
+        serial: str | int,
         *,
         name: str = "asm",
         layout: str = "",
@@ -186,7 +187,7 @@ class AsmMirror(AdaptiveSecondary):
         emulator: Emulator | None = None,
         **options: Any,
     ) -> None:
-        self._options = parse_options(AsmOptions, name, options)
+        self._options = parse_options(AsmOptions, name, options, keywords_of(type(self)))
         super().__init__(name, limits or CAUTIOUS_LIMITS, lift=self._options.lift)
         self._expected = ExpectedMirror(require_serial("serial", serial), layout, pitch_m, stroke_m, limits)
         self._make_codec, self._emulator = make_codec, emulator
@@ -272,7 +273,7 @@ class AsmMirror(AdaptiveSecondary):
         disabled = require_compatible(self.name, self.limits, self._stroke_m, welcome)
         if disabled:
             in_hardware = self._numbers_in_hardware(disabled)
-            self._link.request(m.SetDisabled(in_hardware, "devices.dm.limits.disabled"), m.Done)
+            self._link.request(m.SetDisabled(in_hardware, "limits.disabled"), m.Done)
         self._last_state, self._consecutive_skips = welcome.state, 0
         is_floating = welcome.state in (ShellState.SET, ShellState.RUNNING)
         self._initial_shape = (
@@ -442,7 +443,7 @@ class AsmMirror(AdaptiveSecondary):
             raise DeviceError(
                 self.name,
                 f"skipped {self._consecutive_skips} commands in a row and kept its last shape; they exceed "
-                f"limits of its own: lower max_slew in devices.{self.name}.limits, and see its health",
+                f"limits of its own: lower limits.max_slew, and see its health",
             )
         return self._to_hardware(self._guard_when_open().last)
 

@@ -8,16 +8,26 @@ import math
 import threading
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, Generic, Protocol, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import model_validator
 
 from escape_drivers.common.camera_limits import TOLERANCE, CameraLimits
-from escape_drivers.common.options import parse_options, require_serial
+from escape_drivers.common.options import require_serial
 from escape_hw.api.camera import Camera, CameraInfo, CameraSettings, Frame, Region
-from escape_hw.config.section import Section
+from escape_hw.config.devices import (
+    BitDepth,
+    ExposureTime,
+    FrameRate,
+    Gain,
+    RegionNumbers,
+    SensorSize,
+    exposure_violations,
+)
+from escape_hw.config.options import parse_options
+from escape_hw.config.section import Section, raise_violations
 from escape_hw.errors import DeviceError, DeviceLost, FrameTimeout, NotOpen, SettingRejected
 
 
@@ -83,39 +93,37 @@ OptionsT = TypeVar("OptionsT", bound=Section)
 UNKNOWN_SENSOR = (0, 0)
 
 
-@dataclass(frozen=True, slots=True)
-class CameraSetup:
+class CameraSetup(Section):
     """What a camera is to be set to when it opens; defaults for one that is opened without a system file.
+
+    Ranges and rules are those of a camera's section in a system file.
 
     Parameters
     ----------
     serial
         Serial number.
     sensor_px
-        Width and height of the sensor as read out, pixels; ``(0, 0)``: as the camera reports.
+        Width and height of the sensor as read out, pixels; by default as the camera reports.
     region
         x, y, width, height, pixels; ``None``: the whole sensor.
     bit_depth
         Bits per pixel.
     exposure_s, frame_rate_hz, gain_db
         See :class:`~escape_hw.api.camera.CameraSettings`.
-
-    Raises
-    ------
-    ConfigError
-        The serial number is missing.
     """
 
     serial: str
-    sensor_px: tuple[int, int] = UNKNOWN_SENSOR
-    region: tuple[int, int, int, int] | None = None
-    bit_depth: int = 10
-    exposure_s: float = 1e-3
-    frame_rate_hz: float = 10.0
-    gain_db: float = 0.0
+    sensor_px: SensorSize = UNKNOWN_SENSOR
+    region: RegionNumbers | None = None
+    bit_depth: BitDepth = 10
+    exposure_s: ExposureTime = 1e-3
+    frame_rate_hz: FrameRate = 10.0
+    gain_db: Gain = 0.0
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "serial", require_serial("serial", self.serial))
+    @model_validator(mode="after")
+    def _rules(self) -> Self:
+        raise_violations(exposure_violations(self.exposure_s, self.frame_rate_hz))
+        return self
 
     def settings(self, sensor_px: tuple[int, int]) -> CameraSettings:
         """The settings for a sensor of this width and height."""
@@ -124,19 +132,20 @@ class CameraSetup:
 
 
 def split_settings(
-    name: str, serial: str, settings: Mapping[str, Any], options: type[OptionsT]
+    name: str, serial: str | int, settings: Mapping[str, Any], options: type[OptionsT]
 ) -> tuple[CameraSetup, OptionsT]:
     """Keywords of a camera's class as its setup and the options of its driver.
 
     Raises
     ------
     ConfigError
-        An option is unknown or wrong, or the serial number is missing.
+        A setting or an option is unknown or wrong, or the serial number is missing.
     """
-    keys = {field.name for field in fields(CameraSetup)} - {"serial"}
-    setup = CameraSetup(serial, **{key: value for key, value in settings.items() if key in keys})
+    keys = CameraSetup.model_fields.keys()
+    given = {key: value for key, value in settings.items() if key in keys}
+    setup = parse_options(CameraSetup, name, {**given, "serial": require_serial("serial", serial)})
     rest = {key: value for key, value in settings.items() if key not in keys}
-    return setup, parse_options(options, name, rest)
+    return setup, parse_options(options, name, rest, ["name", *keys])
 
 
 class BlockingCamera(Camera, Generic[C]):
@@ -240,6 +249,18 @@ class BlockingCamera(Camera, Generic[C]):
         if self._limits is None:
             raise NotOpen(self.name, "is not connected; call open() first")
         return self._limits
+
+    def _check_setup(self) -> CameraSettings:
+        """Nearest achievable settings to open with, on the sensor that was adopted.
+
+        Raises
+        ------
+        SettingRejected
+            As :meth:`check`, whose rules need no open camera.
+        """
+        want = self._setup.settings(self._sensor_px)
+        self._require_valid(want)
+        return self._check(want)
 
     def _check(self, want: CameraSettings) -> CameraSettings:
         answer = self._require_limits().nearest_valid(self.name, want, self._max_exposure_s(want))

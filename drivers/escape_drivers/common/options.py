@@ -1,23 +1,18 @@
-"""Settings of a driver: from its device section, or from the keywords of a device opened alone."""
+"""Settings of a driver: from its device section, or from the keywords of a device used alone."""
 
 from __future__ import annotations
 
-import difflib
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, TypeVar
+import inspect
+from typing import TYPE_CHECKING, Any
 
-from pydantic import ValidationError
-from pydantic_core import ErrorDetails
-
-from escape_hw.config.key_tree import range_text
+from escape_hw.api.device import Device
 from escape_hw.config.layouts import n_actuators
+from escape_hw.config.options import parse_options
 from escape_hw.config.section import Section
 from escape_hw.errors import ConfigError, DeviceError
 
 if TYPE_CHECKING:
     from escape_hw.config.devices import CameraConfig, DeviceConfig, MirrorConfig
-
-Options = TypeVar("Options", bound=Section)
 
 
 def _round(*rows: int) -> str:
@@ -40,41 +35,15 @@ _KNOWN_LAYOUTS = {
 }
 
 
-def parse_options(kind: type[Options], device: str, options: Mapping[str, Any]) -> Options:
-    """The options of a device that is opened alone.
-
-    Raises
-    ------
-    ConfigError
-        Every unknown option (with the nearest one) and every wrong value, at once.
-    """
-    return _parse(kind, device, options)
-
-
 def section_options(kind: type[Section], device: str, section: DeviceConfig) -> dict[str, Any]:
     """The options of the section ``devices.DEVICE``, as keywords. Raises as :func:`parse_options`."""
-    return _parse(kind, f"devices.{device}.options", section.options).model_dump()
+    return parse_options(kind, f"devices.{device}.options", section.options).model_dump()
 
 
-def _parse(kind: type[Options], where: str, options: Mapping[str, Any]) -> Options:
-    try:
-        return kind.model_validate(dict(options))
-    except ValidationError as error:
-        problems = (_describe(kind, where, detail) for detail in error.errors(include_url=False))
-        raise ConfigError("\n".join(problems)) from None
-
-
-def _describe(kind: type[Section], where: str, detail: ErrorDetails) -> str:
-    key, fields = str(detail["loc"][0]), kind.model_fields
-    where = f"{where}.{key}"
-    if key not in fields:
-        near = difflib.get_close_matches(key, fields, n=1)
-        hint = f"did you mean '{near[0]}'? " if near else ""
-        return f"{where}: unknown option ({hint}there are: {', '.join(fields)})"
-    allowed = range_text(fields[key])
-    outside = detail["type"].startswith(("greater_than", "less_than"))
-    message = "is out of range" if outside else detail["msg"].replace("Input should be", "must be")
-    return f"{where}: {detail['input']!r}  {message}{f' (allowed range {allowed})' if allowed else ''}"
+def keywords_of(kind: type[Device]) -> list[str]:
+    """Keywords of a driver's class, without those that it passes on as options."""
+    parameters = inspect.signature(kind).parameters.values()
+    return [one.name for one in parameters if one.kind is not inspect.Parameter.VAR_KEYWORD]
 
 
 def mirror_settings(device: str, section: MirrorConfig) -> dict[str, Any]:
@@ -97,17 +66,31 @@ def camera_settings(device: str, section: CameraConfig) -> dict[str, Any]:
     return {"name": device, **{key: getattr(section, key) for key in keys}}
 
 
-def require_serial(where: str, serial: str) -> str:
-    """The serial number without spaces around it; without one, no hardware is opened.
+def serial_text(where: str, serial: str | int) -> str:
+    """A serial number without spaces around it; it may be empty.
 
     Raises
     ------
     ConfigError
-        There is none; ``where`` names the key.
+        It is neither text nor a whole number; ``where`` names the key.
     """
-    if not serial.strip():
+    if isinstance(serial, bool) or not isinstance(serial, str | int):
+        raise ConfigError(f"{where}: {serial!r}  must be text or a whole number")
+    return str(serial).strip()
+
+
+def require_serial(where: str, serial: str | int) -> str:
+    """As :func:`serial_text`; without a serial number, no hardware is opened.
+
+    Raises
+    ------
+    ConfigError
+        There is none.
+    """
+    text = serial_text(where, serial)
+    if not text:
         raise ConfigError(f"{where}: ''  a real device is opened by its serial number only; enter it")
-    return serial.strip()
+    return text
 
 
 def known_layout(n_act: int) -> str:

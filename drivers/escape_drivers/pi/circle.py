@@ -72,7 +72,7 @@ class CircleGenerator:
                 self._name,
                 f"frequency_hz is {want.frequency_hz:g}; it does up to "
                 f"{1 / (self._stage.min_points * servo_s):g} Hz (wave generator's clock "
-                f"{servo_s * 1e6:g} us, devices.modulator.stage.min_points)",
+                f"{servo_s * 1e6:g} us, stage.min_points)",
             )
         achieved = Modulation(want.radius_rad, turn.frequency_hz(servo_s), want.centre_rad)
         self._waves(achieved, turn, self._response(turn))
@@ -131,7 +131,7 @@ class CircleGenerator:
             self._name,
             f"draws {modulation} with an error of {self.error:.1%} of the radius after {_ROUNDS} "
             "corrections; is the mirror's load too high for this frequency? The limit is "
-            "devices.modulator.stage.circle_tolerance",
+            "stage.circle_tolerance",
         )
 
     def stop(self) -> None:
@@ -186,7 +186,7 @@ class CircleGenerator:
             available = ", ".join(f"{row[0]:g}" for row in rows)
             raise SettingRejected(
                 self._name,
-                f"frequency_hz is {frequency:.6g}, and devices.modulator.stage.corrections has rows "
+                f"frequency_hz is {frequency:.6g}, and stage.corrections has rows "
                 f"for {available} Hz only; 'recorder' measures others",
             )
         return pi_circle.response_from_row(near[0]) if near else (1 + 0j, 1 + 0j)
@@ -230,7 +230,7 @@ class CircleGenerator:
         return Modulation(float(radii.mean()), frequency, (float(centre[0]), float(centre[1])))
 
     def corrections(self) -> list[list[float]]:
-        """What was measured, as rows of ``devices.modulator.stage.corrections``."""
+        """What was measured, as rows of ``stage.corrections``."""
         rows = []
         for servo_periods, response in sorted(self._responses.items()):
             words = pi_circle.response_to_row(1 / (servo_periods * self._travel.servo_s), response)

@@ -144,7 +144,7 @@ class E727:
                 raise DeviceError(
                     self.link.name,
                     f"has not settled at {there} within {longest_s:g} s, it is at {here} (its units); "
-                    "is the platform free to move? The longest wait is devices.modulator.stage.settle_s",
+                    "is the platform free to move? The longest wait is stage.settle_s",
                 )
             sleep(_POLL_S)
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from escape_hw.errors import DeviceError
 
 _SERVO_HINT = "open the device anew, which switches the servos on in the right order"
-_AXES_HINT = "compare devices.modulator.stage.axes with the controller's axes (SAI?, CST?)"
+_AXES_HINT = "compare stage.axes with the controller's axes (SAI?, CST?)"
 _RANGE_HINT = "lower the radius or the centre; the controller's own limits are TMN? and TMX?"
 _DRIVER_DEFECT = "this is a defect of the driver or a firmware that differs; see the bench checklist"
 _ERRORS: dict[int, tuple[str, str]] = {
@@ -50,8 +50,8 @@ _ERRORS: dict[int, tuple[str, str]] = {
     61: ("auto-zero is running", "wait until it has ended (about a minute)"),
     63: ("the controller is initialising", "wait a few seconds and open again"),
     64: ("read only", _DRIVER_DEFECT),
-    66: ("voltage out of limits", "see devices.modulator.stage.auto_zero_v"),
-    67: ("not enough memory for the wave", "lower devices.modulator.stage.max_points"),
+    66: ("voltage out of limits", "see stage.auto_zero_v"),
+    67: ("not enough memory for the wave", "lower stage.max_points"),
     72: ("an analogue input drives the axis", "take the analogue input off the axis (parameter 0x06000500)"),
     73: ("a wave generator drives the axis", "park first: escape modulator stop"),
     75: ("no wave table is selected", _DRIVER_DEFECT),

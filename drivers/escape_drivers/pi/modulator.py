@@ -7,13 +7,14 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
+from pydantic import Field
 
-from escape_drivers.common.options import parse_options
+from escape_drivers.common.options import keywords_of, require_serial
 from escape_drivers.pi.circle import AxisResponse, CircleGenerator
 from escape_drivers.pi.controller import E727
 from escape_drivers.pi.gcs import MalformedReply
@@ -21,7 +22,8 @@ from escape_drivers.pi.link import GcsLink
 from escape_drivers.pi.transports import Transport, make_transport
 from escape_drivers.pi.travel import AxisTravel, read_travel
 from escape_hw.api.modulator import Modulation, ModulatorInfo, ModulatorStatus, TipTiltModulator
-from escape_hw.config.devices import StageConfig, WireConfig
+from escape_hw.config.devices import LargestTilt, StageConfig, WireConfig
+from escape_hw.config.options import parse_options
 from escape_hw.config.registry import DeviceContext
 from escape_hw.errors import DeviceError, DeviceLost
 
@@ -77,7 +79,7 @@ def _auto_zero(name: str, controller: E727, stage: StageConfig, sleep: Callable[
                     name,
                     f"auto-zero of axis {axis} has not ended after {stage.auto_zero_s:g} s; is the "
                     "platform free to move, its cable plugged in? The longest wait is "
-                    "devices.modulator.stage.auto_zero_s",
+                    "stage.auto_zero_s",
                 )
             sleep(_POLL_S)
 
@@ -89,6 +91,21 @@ _UNREACHABLE_NOTE = (
     "the stage continues its motion; opening it again stops and centres it, switching off its power "
     "releases it"
 )
+
+
+class PiSettings(WireConfig):
+    """Settings of a stage: the keys of its connection, and these.
+
+    Parameters
+    ----------
+    max_tilt_rad
+        Largest tilt of the mirror from its centre, radians; the travel that the stage reports limits it too.
+    stage
+        Axes and correction of the circle: a :class:`~escape_hw.config.devices.StageConfig` or its keys.
+    """
+
+    max_tilt_rad: LargestTilt = CAUTIOUS_TILT_RAD
+    stage: StageConfig = Field(default_factory=StageConfig)
 
 
 class _Connection(NamedTuple):
@@ -113,46 +130,36 @@ class PiModulator(TipTiltModulator):
     Parameters
     ----------
     serial
-        Serial number of the controller; one with another number is refused. Empty: any.
+        Serial number of the controller; one with another number is refused.
     name
         Name in messages.
-    max_tilt_rad
-        Largest tilt of the mirror from its centre, radians; the travel that the stage reports limits it too.
-    stage
-        Axes and correction of the circle: a :class:`~escape_hw.config.devices.StageConfig` or its keys.
     connect
-        Makes the transport; absent: by ``wire``.
+        Makes the transport; absent: by the settings.
     sleep
         Waits for so many seconds.
-    **wire
-        Keys of :class:`~escape_hw.config.devices.WireConfig`, such as ``host``.
+    **settings
+        Fields of :class:`PiSettings`, such as ``host``.
 
     Raises
     ------
     ConfigError
-        A setting is unknown or wrong.
+        The serial number is missing, or a setting is unknown or wrong.
     """
 
     def __init__(
         self,
-        serial: str = "",
+        serial: str | int,
         *,
         name: str = "modulator",
-        max_tilt_rad: float = CAUTIOUS_TILT_RAD,
-        stage: StageConfig | Mapping[str, Any] | None = None,
         connect: Callable[[], Transport] | None = None,
         sleep: Callable[[float], None] = time.sleep,
-        **wire: Any,
+        **settings: Any,
     ) -> None:
         super().__init__(name)
-        self._serial, self._max_tilt_rad, self._sleep = serial.strip(), max_tilt_rad, sleep
-        self._stage = (
-            stage
-            if isinstance(stage, StageConfig)
-            else parse_options(StageConfig, f"{name}.stage", stage or {})
-        )
-        self._wire = wire_ = parse_options(WireConfig, name, wire)
-        self._connect = connect or (lambda: make_transport(wire_, self._serial, {}, DeviceContext(name)))
+        self._serial, self._sleep = require_serial("serial", serial), sleep
+        self._settings = wire = parse_options(PiSettings, name, settings, keywords_of(type(self)))
+        self._stage = wire.stage
+        self._connect = connect or (lambda: make_transport(wire, self._serial, {}, DeviceContext(name)))
         self._connection: _Connection | None = None
         self._modulation: Modulation | None = None
         #: Survives closing: the mirror on the stage stays the same.
@@ -160,9 +167,9 @@ class PiModulator(TipTiltModulator):
 
     @classmethod
     def from_section(cls, section: ModulatorConfig, context: DeviceContext) -> Self:
-        """The modulator of ``[devices.modulator]``."""
+        """The modulator of ``[devices.modulator]``; raises ``ConfigError`` as the class does."""
         return cls(
-            section.serial,
+            require_serial(f"devices.{context.name}.serial", section.serial),
             name=context.name,
             max_tilt_rad=section.max_tilt_rad,
             stage=section.stage,
@@ -204,7 +211,7 @@ class PiModulator(TipTiltModulator):
     @contextmanager
     def _open_connection(self) -> Iterator[_Connection]:
         """Connect and learn what is there; moves nothing. Hangs up again when that, or the body, fails."""
-        link = GcsLink(self.name, self._connect(), self._wire.timeout_s)
+        link = GcsLink(self.name, self._connect(), self._settings.timeout_s)
         try:
             link.open()
             controller = E727(link, self._stage.axes)
@@ -214,7 +221,7 @@ class PiModulator(TipTiltModulator):
                 circle_generator = CircleGenerator(
                     self.name, controller, self._stage, travel, self._responses, self._sleep
                 )
-                reach = min(travel.reach_rad, self._max_tilt_rad)
+                reach = min(travel.reach_rad, self._settings.max_tilt_rad)
                 info = ModulatorInfo(model, controller.serial, reach, "emulated" in link.identity)
                 yield _Connection(controller, travel, circle_generator, info)
         except BaseException:
@@ -304,7 +311,7 @@ class PiModulator(TipTiltModulator):
         return ModulatorStatus(connection.info, modulation, (float(tilt[0]), float(tilt[1])), details)
 
     def _release(self) -> bool:
-        if self._wire.kind == "emulator":
+        if self._settings.kind == "emulator":
             # It ends with the connection.
             return False
         connection, self._connection, self._modulation = self._require_connection(), None, None

@@ -64,7 +64,7 @@ class TcpTransport:
         except TimeoutError as error:
             raise TransportLost(
                 f"no answer from {self.where} within {self._connect_s:g} s; is the controller "
-                "switched on, the cable plugged in, and devices.modulator.wire.host its address?"
+                "switched on, the cable plugged in, and host its address?"
             ) from error
         except OSError as error:
             raise TransportLost(
@@ -244,8 +244,8 @@ class UsbTransport:
                 ", ".join(candidate.serial_number or "?" for candidate in present) or "none of this vendor"
             )
             raise TransportLost(
-                f"{len(found)} controllers match {self.where} (there: {serial_numbers}); set "
-                "devices.modulator.serial, or see to cable and power"
+                f"{len(found)} controllers match {self.where} (there: {serial_numbers}); correct "
+                "serial, or see to cable and power"
             )
         return found[0]
 
@@ -270,7 +270,7 @@ class UsbTransport:
         if self._in is None or self._out is None:
             self.close()
             raise TransportLost(
-                f"{self.where} has no pair of bulk endpoints; is wire.usb_product the controller's?"
+                f"{self.where} has no pair of bulk endpoints; is usb_product the controller's?"
             )
 
     def close(self) -> None:
@@ -331,7 +331,7 @@ ADDRESS_VARIABLE = "ESCAPE_E727"
 def make_transport(
     wire: WireConfig, serial: str, options: Mapping[str, object], context: DeviceContext
 ) -> Transport:
-    """The wire that ``devices.modulator.wire`` names, or :data:`ADDRESS_VARIABLE`; not open.
+    """The wire that ``wire`` names, or :data:`ADDRESS_VARIABLE`; not open.
 
     ``options`` are those of an emulator.
 

@@ -68,17 +68,17 @@ def read_travel(name: str, controller: E727, serial: str, stage: StageConfig) ->
     if want and want != found:
         raise DeviceError(
             name,
-            f"found the controller with serial number {found!r}, not {want!r}; see devices.modulator.serial",
+            f"found the controller with serial number {found!r}, not {want!r}; correct serial or the address",
         )
     axes = stage.axes
     present = controller.axis_names()
     for axis in axes:
         if axis not in present:
             text = f"has no axis {axis!r}, only {', '.join(present)}"
-            raise DeviceError(name, f"{text}; see devices.modulator.stage.axes")
+            raise DeviceError(name, f"{text}; see stage.axes")
     for axis, carried in zip(axes, controller.stage_names(), strict=True):
         if "NOSTAGE" in carried.upper():
-            raise DeviceError(name, f"axis {axis} carries no stage; see devices.modulator.stage.axes")
+            raise DeviceError(name, f"axis {axis} carries no stage; see stage.axes")
     lower, upper = controller.limits()
     if not all(low < high for low, high in zip(lower, upper, strict=True)):
         text = f"reports limits {lower} to {upper}"

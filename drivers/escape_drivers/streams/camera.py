@@ -80,9 +80,10 @@ class StreamCamera(BlockingCamera[Stream]):
 
     SOURCE: ClassVar[StreamSource]
 
-    def __init__(self, stream: str, *, serial: str = "", name: str = "camera", **settings: Any) -> None:
+    def __init__(self, stream: str, *, serial: str | int = "", name: str = "camera", **settings: Any) -> None:
+        settings = {**settings, "stream": stream}
         serial = stream_serial("stream", serial, stream)
-        setup, options = split_settings(name, serial, {**settings, "stream": stream}, StreamCameraOptions)
+        setup, options = split_settings(name, serial, settings, StreamCameraOptions)
         super().__init__(name, setup, self.SOURCE.kind, _COUNTER_RANGE)
         self._options = options
         self._info = self._make_info(self.SOURCE.kind)
@@ -107,6 +108,7 @@ class StreamCamera(BlockingCamera[Stream]):
         self._adopt_sensor((stream.shape[1], stream.shape[0]), "to the size of the stream")
         self._info = self._make_info(f"{self.SOURCE.kind} {stream.name}")
         now = self._setup.settings(self._sensor_px)
+        self._require_valid(now)
         rate = self._measure_rate(stream) or now.frame_rate_hz
         self._settings = replace(now, frame_rate_hz=rate, exposure_s=min(now.exposure_s, 1 / rate))
 

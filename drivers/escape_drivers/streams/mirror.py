@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from escape_drivers.common.options import layout_of, mirror_settings, parse_options, section_options
+from escape_drivers.common.options import keywords_of, layout_of, mirror_settings, section_options
 from escape_drivers.streams.source import (
     MILK,
     PYRTC,
@@ -21,6 +21,7 @@ from escape_drivers.streams.source import (
 from escape_hw.api.mirror import DeformableMirror, DMInfo
 from escape_hw.config import layouts
 from escape_hw.config.devices import mirror_info
+from escape_hw.config.options import parse_options
 from escape_hw.config.section import Section
 from escape_hw.errors import DeviceError, NotOpen
 from escape_hw.io.interchange.stream import Stream
@@ -86,7 +87,7 @@ class StreamMirror(DeformableMirror):
         self,
         stream: str,
         *,
-        serial: str = "",
+        serial: str | int = "",
         name: str = "dm",
         layout: str = "",
         pitch_m: float = 1.0,
@@ -96,7 +97,8 @@ class StreamMirror(DeformableMirror):
     ) -> None:
         super().__init__(name, limits)
         self._serial = stream_serial("stream", serial, stream)
-        self._options = parse_options(StreamMirrorOptions, name, {**options, "stream": stream})
+        options = {**options, "stream": stream}
+        self._options = parse_options(StreamMirrorOptions, name, options, keywords_of(type(self)))
         self._layout, self._pitch_m, self._stroke_m = layout, pitch_m, stroke_m
         self._stream: Stream | None = None
         self._scaled_command, self._buffer = np.empty(0), np.empty(0)

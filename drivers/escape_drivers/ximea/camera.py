@@ -126,10 +126,10 @@ class XimeaCamera(BlockingCamera[XimeaLibrary]):
     Raises
     ------
     ConfigError
-        The serial number is missing or an option is wrong.
+        The serial number is missing, or a setting is unknown or wrong.
     """
 
-    def __init__(self, serial: str, *, name: str = "ximea", **settings: Any) -> None:
+    def __init__(self, serial: str | int, *, name: str = "ximea", **settings: Any) -> None:
         setup, options = split_settings(name, serial, settings, XimeaOptions)
         super().__init__(name, setup, "XIMEA camera", (0, _NO_FRAME_NUMBER))
         self._options = options
@@ -174,7 +174,7 @@ class XimeaCamera(BlockingCamera[XimeaLibrary]):
         self._info = self._build_info(f"XIMEA {model}", library.stand_in)
         self._is_stand_in = library.stand_in
         self._get_image = library.c.xiGetImage
-        self._settings = self._apply_settings(self._check(self._setup.settings(sensor)))
+        self._settings = self._apply_settings(self._check_setup())
 
     def _disconnect(self) -> None:
         self._get_image = _raise_not_connected

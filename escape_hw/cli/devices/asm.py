@@ -73,8 +73,8 @@ def clear(
             after = mirror.health
     context.show(f"fault: {previous.fault or 'none'}; now {after.state}")
     context.report(
-        simulated=mirror.info.simulated, changed=after is not previous, before=previous.state,
-        fault=previous.fault, after=after.state,
+        simulated=mirror.info.simulated, serial=mirror.info.serial, changed=after is not previous,
+        before=previous.state, fault=previous.fault, after=after.state,
     )  # fmt: skip
 
 
@@ -106,8 +106,8 @@ def _go_to_state(context: CommandContext, selection: options.SystemSelection, *,
         health = mirror.health
     context.show(f"{previous} → {health.state}", *_format_health(health))
     context.report(
-        simulated=mirror.info.simulated, changed=previous is not health.state, before=previous,
-        after=health.state, health=asdict(health),
+        simulated=mirror.info.simulated, serial=mirror.info.serial, changed=previous is not health.state,
+        before=previous, after=health.state, health=asdict(health),
     )  # fmt: skip
 
 

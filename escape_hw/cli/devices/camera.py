@@ -62,7 +62,7 @@ def snap(
         *([f"written: {out}"] if out is not None else []),
     )
     context.report(
-        simulated=info.simulated, changed=changed, camera=camera, frames=len(frame_list),
+        simulated=info.simulated, serial=info.serial, changed=changed, camera=camera, frames=len(frame_list),
         shape=cube.shape[1:], counts=counts, saturated=saturated, lost=status.lost,
         first_index=frame_list[0].index, settings=asdict(settings), file=out,
     )  # fmt: skip
@@ -93,8 +93,8 @@ def stream(
         f"{statistics.saturated} saturated",
     )
     context.report(
-        simulated=info.simulated, changed=changed, camera=camera, settings=asdict(settings),
-        **asdict(statistics),
+        simulated=info.simulated, serial=info.serial, changed=changed, camera=camera,
+        settings=asdict(settings), **asdict(statistics),
     )  # fmt: skip
     context.code = context.code or int(statistics.status.lost > 0)
 
@@ -130,8 +130,8 @@ def settings(
     if now != requested:
         context.notify(f"requested: {requested}")
     context.report(
-        simulated=info.simulated, changed=not check, camera=camera, asked=asdict(requested),
-        settings=asdict(now), as_asked=now == requested,
+        simulated=info.simulated, serial=info.serial, changed=not check, camera=camera,
+        asked=asdict(requested), settings=asdict(now), as_asked=now == requested,
     )  # fmt: skip
 
 

@@ -36,7 +36,8 @@ class SelectedDevice(Generic[D]):
     key: str
     device: D
     config: SystemConfig | None
-    selection: SystemSelection
+    #: Driver and serial number, or its place in the system and serial number.
+    label: str
 
     @property
     def section(self) -> Any:
@@ -53,31 +54,35 @@ class SelectedDevice(Generic[D]):
     def announce_change(self, context: CommandContext, what: str) -> None:
         """Announce how a real device is about to change; nothing for a simulated one."""
         if self.is_hardware:
-            name = f"{self.selection.driver} {self.selection.serial}"
-            if self.config is not None:
-                name = f"devices.{self.key} {self.section.serial}"
-            context.notify(f"this changes hardware, {name}: {what}")
+            context.notify(f"this changes hardware, {self.label}: {what}")
 
 
 def select_device(
     context: CommandContext, selection: SystemSelection, key: str, kind: type[D]
 ) -> SelectedDevice[D]:
     """One device of a system, or of a driver; not open."""
-    from escape_hw.bench import build_device, build_standalone_device
+    from escape_hw.bench import build_device, build_standalone_device, resolve_mode
 
     if not selection.driver:
         if selection.serial:
             raise ConfigError(f"--serial {selection.serial}: goes with --driver; a system file has its own")
         config = context.load_config(selection)
-        if getattr(config.devices, key) is None:
+        section = getattr(config.devices, key)
+        if section is None:
             raise ConfigError(f"system '{config.system.name}' has no {key}, [devices.{key}]")
-        return SelectedDevice(key, build_device(key, config, kind), config, selection)
+        twin = resolve_mode(section, config) == "sim"
+        context.set_device(section.sim_driver if twin else section.driver, section.serial)
+        label = f"devices.{key} {section.serial}".rstrip()
+        return SelectedDevice(key, build_device(key, config, kind), config, label)
     if selection.mode is not None or selection.seed is not None:
         raise ConfigError("--mode and --seed: not with --driver, which opens one real device")
     settings = _parse_settings(selection.set)
     if selection.serial:
         settings["serial"] = selection.serial
-    return SelectedDevice(key, build_standalone_device(selection.driver, kind, **settings), None, selection)
+    serial = str(settings.get("serial", ""))
+    context.set_device(selection.driver, serial)
+    device = build_standalone_device(selection.driver, kind, **settings)
+    return SelectedDevice(key, device, None, f"{selection.driver} {serial}".rstrip())
 
 
 def _parse_settings(changes: tuple[str, ...]) -> dict[str, Any]:

@@ -36,7 +36,7 @@ def flat(context: CommandContext, selection: options.DeviceSelection) -> None:
         dm.flatten()
         info, sent = dm.info, dm.sent_count
     context.show(f"{info.model} {info.serial}: flat after {sent} commands")
-    context.report(simulated=info.simulated, changed=True, commands=sent)
+    context.report(simulated=info.simulated, serial=info.serial, changed=True, commands=sent)
 
 
 # Otherwise a negative amplitude is parsed as an option.
@@ -64,7 +64,7 @@ def poke(
         info = dm.info
     asked = {"actuator": actuator, "amplitude": amplitude, "seconds": seconds}
     context.show(f"{info.model} {info.serial}: actuator {actuator} by {amplitude:g}, then flat")
-    context.report(simulated=info.simulated, changed=True, asked=asked, **asdict(motion))
+    context.report(simulated=info.simulated, serial=info.serial, changed=True, asked=asked, **asdict(motion))
 
 
 @app.command("wave", cls=DeviceCommand)
@@ -92,7 +92,7 @@ def wave(
     context.show(
         f"{info.model} {info.serial}: {motion.commands} commands, largest {motion.peak:.4g}, then flat"
     )
-    context.report(simulated=info.simulated, changed=True, asked=asked, **asdict(motion))
+    context.report(simulated=info.simulated, serial=info.serial, changed=True, asked=asked, **asdict(motion))
 
 
 @app.command("status", cls=DeviceCommand)

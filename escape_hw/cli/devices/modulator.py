@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import time
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated, Any
@@ -67,7 +68,8 @@ def start(
             time.sleep(seconds)
         status = device.status()
         left = seconds is None and device.release()
-    final_state = "modulating; stop it with: escape modulator stop" if left else "parked"
+    command_line = shlex.join(("escape", "modulator", "stop", *selection.words()))
+    final_state = f"modulating; stop it with: {command_line}" if left else "parked"
     context.show(*_format_status(status, section), f"left {final_state}")
     asked = {"frequency_hz": requested.frequency_hz}
     if (radius_lambda_d := _lambda_d(requested, section)) is None:
@@ -159,7 +161,7 @@ def _format_status(status: ModulatorStatus, section: ModulatorConfig | None) -> 
 
 def _status_fields(status: ModulatorStatus, section: ModulatorConfig | None) -> dict[str, Any]:
     """The status in the command's document."""
-    found = {"simulated": status.info.simulated, **asdict(status)}
+    found = {"simulated": status.info.simulated, "serial": status.info.serial, **asdict(status)}
     if status.modulation is not None:
         found["modulation"]["radius_lambda_d"] = _lambda_d(status.modulation, section)
     return found
