@@ -85,6 +85,19 @@ def test_triggered_sequences_follow_each_other_and_closing_waits_for_no_edge(asd
     assert not asdk.violations
 
 
+@pytest.mark.parametrize("repeats", [0, 1])
+def test_closing_stops_a_triggered_sequence_before_it_switches_the_trigger_off(asdk, repeats) -> None:
+    rows = np.zeros((3, 97))
+    rows[1] = 0.01
+    with make("alpao", "devices.dm.options.trigger_in=rising") as dm:
+        dm.play_patterns(rows, repeats)
+        n_before = len(asdk.calls)
+    closing = [line for line in asdk.calls[n_before:] if not line.startswith("asdkSend")]
+    assert closing == ["asdkStop", "asdkSet TriggerIn 0", *CLOSING]
+    assert "asdkSend" in asdk.names()[n_before:], "it is ramped flat, not only reset"
+    assert not asdk.violations
+
+
 def test_the_serial_number_goes_out_in_capitals(asdk) -> None:
     asdk.script("set serial BAX118")
     with make("alpao", "devices.dm.serial=bax118"):

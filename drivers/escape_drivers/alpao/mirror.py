@@ -189,8 +189,9 @@ class AlpaoMirror(DeformableMirror):
             library.call("asdkSendPattern", handle, pointer, len(sequence), repeats)
             self._guard_when_open().reset(sequence[-1])
 
-    def _set_trigger(self, library: AlpaoLibrary, handle: c_void_p, trigger_in: str) -> None:
+    def _set_trigger(self, trigger_in: str) -> None:
         """Set the trigger's edge; electronics without triggers need no "off"."""
+        library, handle = self._require_connected()
         try:
             library.set(handle, "TriggerIn", _TRIGGER_IN[trigger_in])
         except DeviceLost:
@@ -201,10 +202,10 @@ class AlpaoMirror(DeformableMirror):
             log.debug("%s: has no trigger (%s)", self.name, error)
 
     def _before_close(self) -> None:
-        """Without the trigger, so that the flat shape waits for no edge."""
-        library, handle = self._require_connected()
+        """Without the trigger, so that the ramp to flat waits for no edge; first of all, a sequence stops."""
+        self._stop_playing(arm_again=False)
         if self._options.is_triggered:
-            self._set_trigger(library, handle, "off")
+            self._set_trigger("off")
         super()._before_close()
 
     def stop_pattern(self) -> None:
@@ -237,7 +238,7 @@ class AlpaoMirror(DeformableMirror):
         log.info("%s: SDK %s, mirror %s", self.name, version, self._serial)
         for name, value in self._options.sdk_parameters():
             library.set(handle, name, value)
-        self._set_trigger(library, handle, self._options.trigger_in or "off")
+        self._set_trigger(self._options.trigger_in or "off")
         self._playing = False
         # A function object of its own without prototype: both arguments are C pointers for good already,
         # and checking them at every call costs as much as the call.
@@ -274,15 +275,16 @@ class AlpaoMirror(DeformableMirror):
         if self._transfer() != 0:
             raise self._require_connected()[0].error_for("asdkSend")
 
-    def _stop_playing(self) -> None:
+    def _stop_playing(self, *, arm_again: bool = True) -> None:
+        if not self._playing:
+            return
         library, handle = self._require_connected()
-        if self._playing:
-            library.call("asdkStop", handle)
-            self._playing = False
-            if self._options.is_triggered:
-                # Users report that a second triggered sequence fails (0x102, 0x104) without this.
-                self._set_trigger(library, handle, "off")
-                self._set_trigger(library, handle, self._options.trigger_in)
+        library.call("asdkStop", handle)
+        self._playing = False
+        if arm_again and self._options.is_triggered:
+            # Users report that a second triggered sequence fails (0x102, 0x104) without this.
+            self._set_trigger("off")
+            self._set_trigger(self._options.trigger_in)
 
     def _validate_sequence(self, patterns: ArrayLike, repeats: int) -> NDArray[np.float64]:
         guard = self._guard_when_open()
