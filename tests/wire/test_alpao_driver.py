@@ -226,6 +226,31 @@ def test_a_pattern_that_breaks_a_limit_anywhere_is_refused_whole(asdk) -> None:
         assert asdk.names().count("asdkSendPattern") == 1
 
 
+def test_a_refused_pattern_leaves_the_shapes_that_the_mirror_may_have(asdk) -> None:
+    with make("alpao", "devices.dm.limits.max_slew=0.1") as dm:
+        dm.flatten()
+        asdk.script("asdkSend 2 unacknowledged")
+        with pytest.raises(DeviceError, match="error 0x10D"):
+            dm.send(np.full(97, 0.1))
+        with pytest.raises(CommandRejected, match="exceeds max_stroke"):
+            dm.play_patterns(np.full((2, 97), 0.9))
+        assert not dm.send(np.full(97, -0.1)).sent.any(), "the mirror may have 0.1"
+
+
+@pytest.mark.parametrize("repeats", [0, 1])
+@pytest.mark.parametrize("wanted", [-0.5, 0.5])
+def test_the_step_after_a_sequence_is_within_the_slew_rule_from_all_its_shapes(asdk, repeats, wanted) -> None:
+    rows, shape = np.zeros((4, 97)), np.zeros(97)
+    rows[:, 5], shape[5] = [0.0, 0.1, 0.2, 0.1], wanted
+    with make("alpao", "devices.dm.limits.max_slew=0.1") as dm:
+        dm.play_patterns(rows, repeats)
+        assert dm.send(shape).sent[5] == pytest.approx(0.1)
+        assert np.abs(asdk.shape(97) - rows).max() <= 0.1 + 1e-12
+        assert dm.send(shape).sent[5] == pytest.approx(0.1 + np.copysign(0.1, wanted)), "known again"
+        with pytest.raises(CommandRejected, match=r"shape 0 .* from a shape that the mirror may have; flatten"):
+            dm.play_patterns(rows[2:] + 0.5 * np.sign(wanted))
+
+
 @settings(max_examples=60, deadline=None)
 @given(st.lists(st.floats(allow_nan=True, allow_infinity=True), min_size=97, max_size=97))
 def test_whatever_is_sent_the_library_gets_finite_values_within_the_cap(values) -> None:

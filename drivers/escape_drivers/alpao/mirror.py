@@ -6,6 +6,7 @@ import logging
 import math
 import os
 from collections.abc import Callable
+from copy import copy
 from ctypes import c_void_p
 from functools import partial
 from typing import TYPE_CHECKING, Any, Literal, Self
@@ -162,7 +163,9 @@ class AlpaoMirror(DeformableMirror):
 
         With ``trigger_in`` each edge brings the next shape. Nothing is clipped here: a sequence that
         breaks a limit anywhere, from the present shape on and from its end to its beginning, is
-        refused as a whole.
+        refused as a whole. The electronics do not tell which shape they have reached: until the next
+        command the slew rule is obeyed from all of them, see :meth:`CommandGuard.mark_sequence
+        <escape_hw.safety.guard.CommandGuard.mark_sequence>`.
 
         Parameters
         ----------
@@ -185,9 +188,9 @@ class AlpaoMirror(DeformableMirror):
             library, handle = self._require_connected()
             # The mirror's shape is unknown from here on, also if the call fails: the next flatten() sends.
             self._playing, self._shape_known = True, False
+            self._guard_when_open().mark_sequence(sequence)
             pointer = c_void_p(in_hardware.ctypes.data)
             library.call("asdkSendPattern", handle, pointer, len(sequence), repeats)
-            self._guard_when_open().reset(sequence[-1])
 
     def _set_trigger(self, trigger_in: str) -> None:
         """Set the trigger's edge; electronics without triggers need no "off"."""
@@ -286,25 +289,24 @@ class AlpaoMirror(DeformableMirror):
             self._set_trigger("off")
             self._set_trigger(self._options.trigger_in)
 
-    def _validate_sequence(self, patterns: ArrayLike, repeats: int) -> NDArray[np.float64]:
-        guard = self._guard_when_open()
+    def _validate_sequence(self, patterns: ArrayLike, repeats: int) -> list[NDArray[np.float64]]:
+        # A copy follows the sequence: a refused one changes nothing that is known of the mirror's shape.
+        guard = copy(self._guard_when_open())
         rows = [guard.validate(row) for row in np.asarray(patterns)]
         if not rows or repeats < 0:
             raise CommandRejected(
                 self.name, f"{len(rows)} shapes, {repeats} repeats; need one and none below 0"
             )
         cyclic_rows = rows if repeats == 1 else [*rows, rows[0]]
-        last = guard.last
-        try:
-            for number, row in enumerate(cyclic_rows):
-                if not guard.is_legal(row):
-                    slew_message = f"is further from the one before than max_slew = {self.limits.max_slew}"
-                    why = guard.find_violation(row) or slew_message
-                    raise CommandRejected(self.name, f"shape {number % len(rows)} of the sequence: {why}")
-                guard.set_last(row)
-        finally:
-            guard.set_last(last)
-        return np.ascontiguousarray(rows)
+        slew = f"max_slew = {self.limits.max_slew}"
+        too_far = f"is further than {slew} from a shape that the mirror may have; flatten() first"
+        for number, row in enumerate(cyclic_rows):
+            if not guard.is_legal(row):
+                why = guard.find_violation(row) or too_far
+                raise CommandRejected(self.name, f"shape {number % len(rows)} of the sequence: {why}")
+            guard.set_last(row)
+            too_far = f"is further from the one before than {slew}"
+        return rows
 
     def _require_connected(self) -> tuple[AlpaoLibrary, c_void_p]:
         if self._library is None or self._handle is None:
