@@ -27,7 +27,7 @@ from escape_hw.api.mirror import DeformableMirror, DMInfo
 from escape_hw.config.devices import mirror_info
 from escape_hw.config.layouts import n_actuators, shorten
 from escape_hw.config.section import Section
-from escape_hw.errors import CommandRejected, DeviceError, DeviceLost, NotOpen
+from escape_hw.errors import CommandRejected, DeviceError, NotOpen
 from escape_hw.safety.limits import CAUTIOUS_LIMITS, MirrorLimits
 
 if TYPE_CHECKING:
@@ -195,14 +195,7 @@ class AlpaoMirror(DeformableMirror):
     def _set_trigger(self, trigger_in: str) -> None:
         """Set the trigger's edge; electronics without triggers need no "off"."""
         library, handle = self._require_connected()
-        try:
-            library.set(handle, "TriggerIn", _TRIGGER_IN[trigger_in])
-        except DeviceLost:
-            raise
-        except DeviceError as error:
-            if trigger_in != "off":
-                raise
-            log.debug("%s: has no trigger (%s)", self.name, error)
+        library.set(handle, "TriggerIn", _TRIGGER_IN[trigger_in], if_supported=trigger_in == "off")
 
     def _before_close(self) -> None:
         """Without the trigger, so that the ramp to flat waits for no edge; first of all, a sequence stops."""
