@@ -12,7 +12,8 @@ from escape_drivers.alpao.library import ERRORS, describe_error, format_version
 from escape_drivers.alpao.mirror import AlpaoMirror
 from escape_hw.bench import build_device
 from escape_hw.config.registry import available
-from escape_hw.errors import CommandRejected, ConfigError, DeviceError, DeviceLost
+from escape_hw.errors import CommandRejected, ConfigError, DeviceError, DeviceLost, SettingRejected
+from escape_hw.safety.limits import MirrorLimits
 
 OPENING = ["asdkInit SIM97", "asdkGet NbOfActuator", "asdkGet VersionInfo", "asdkSet TriggerIn 0"]
 CLOSING = ["asdkStop", "asdkReset", "asdkRelease"]
@@ -178,11 +179,22 @@ def test_a_failure_without_a_reason_is_one(asdk) -> None:
 
 
 def test_a_wrong_number_of_actuators_is_refused(asdk) -> None:
-    asdk.script("set actuators 277")
+    dm = make("alpao")
+    with dm:
+        dm.send(np.full(97, 0.1))
+    asdk.clear().script("set actuators 277")
     with pytest.raises(DeviceError, match="has 277 actuators, but the layout 'circle-11' has 97"):
-        make("alpao").open()
+        dm.open()
     assert asdk.calls[-1] == "asdkRelease"
     assert "asdkReset" not in asdk.calls, "nothing had moved"
+
+
+def test_limits_that_do_not_fit_the_mirror_leave_it_as_it_was(asdk) -> None:
+    dm = AlpaoMirror("SIM97", library=str(asdk.path), limits=MirrorLimits(disabled=(97,)))
+    with pytest.raises(SettingRejected, match=r"disabled actuators \(97,\) do not all lie in 0\.\.96"):
+        dm.open()
+    assert asdk.calls == [*OPENING, "asdkRelease"]
+    assert not asdk.violations
 
 
 def test_one_mirror_has_one_owner(asdk) -> None:

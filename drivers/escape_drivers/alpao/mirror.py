@@ -137,6 +137,8 @@ class AlpaoMirror(DeformableMirror):
         self._handle: c_void_p | None = None
         self._transfer: Callable[[], int] = _raise_not_connected
         self._playing = False
+        #: Whether a shape was sent since opening, so that closing has to reset the mirror.
+        self._has_moved = False
         self._info = self._build_info("ALPAO mirror", False) if layout else None
 
     @classmethod
@@ -187,7 +189,8 @@ class AlpaoMirror(DeformableMirror):
             self._stop_playing()
             library, handle = self._require_connected()
             # The mirror's shape is unknown from here on, also if the call fails: the next flatten() sends.
-            self._playing, self._shape_known = True, False
+            self._playing = self._has_moved = True
+            self._shape_known = False
             self._guard_when_open().mark_sequence(sequence)
             pointer = c_void_p(in_hardware.ctypes.data)
             library.call("asdkSendPattern", handle, pointer, len(sequence), repeats)
@@ -211,6 +214,7 @@ class AlpaoMirror(DeformableMirror):
             self._stop_playing()
 
     def _open(self) -> None:
+        self._playing = self._has_moved = False
         if self._options.config_folder:
             os.environ[_CONFIG_VARIABLE] = self._options.config_folder
         library = self._library = AlpaoLibrary(self.name, self._options.library)
@@ -235,7 +239,6 @@ class AlpaoMirror(DeformableMirror):
         for name, value in self._options.sdk_parameters():
             library.set(handle, name, value)
         self._set_trigger(self._options.trigger_in or "off")
-        self._playing = False
         # A function object of its own without prototype: both arguments are C pointers for good already,
         # and checking them at every call costs as much as the call.
         # The buffer never moves, so its address is made once.
@@ -250,7 +253,8 @@ class AlpaoMirror(DeformableMirror):
         self._playing, self._transfer = False, _raise_not_connected
         if library is None or handle is None:
             return
-        for name in ("asdkStop", "asdkReset", "asdkRelease"):
+        # After a failed opening, or if nothing could be sent, the mirror keeps the shape that it had.
+        for name in (*(("asdkStop", "asdkReset") if self._has_moved else ()), "asdkRelease"):
             try:
                 library.call(name, handle)
             except DeviceError as error:
@@ -258,15 +262,12 @@ class AlpaoMirror(DeformableMirror):
                 log.warning("while closing: %s", error)
 
     def _release_after_failed_open(self) -> None:
-        """Release a mirror that was opened in vain; nothing has moved, so nothing is reset."""
-        library, handle = self._library, self._handle
-        self._library = self._handle = None
-        if library is not None and handle is not None:
-            library.call("asdkRelease", handle)
+        self._close()
 
     def _send(self, command: NDArray[np.float64]) -> None:
         if self._playing:
             self._stop_playing()
+        self._has_moved = True
         self._buffer[:] = command
         if self._transfer() != 0:
             raise self._require_connected()[0].error_for("asdkSend")
