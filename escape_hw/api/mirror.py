@@ -257,6 +257,12 @@ class DeformableMirror(Device):
                 self.name,
                 f"order has {self.order.size} numbers; it must have each of 0 to {info.n_act - 1} once",
             )
+        if self._flat is not None and self._flat.size != info.n_act:
+            raise SettingRejected(
+                self.name,
+                f"its flat shape is of {self._flat.size} actuators, and it has {info.n_act}; make a new object "
+                "for another mirror",
+            )
         present = self._present_in_layout()
         guard.reset(present)
         self._guard, self._shape_known = guard, present is not None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from copy import copy
 from ctypes import c_void_p
 from functools import partial
@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
 from escape_drivers.alpao.library import AlpaoLibrary, format_version
+from escape_drivers.common.mirror import parse_limits, require_geometry
 from escape_drivers.common.options import (
     known_layout,
     mirror_settings,
@@ -105,33 +106,34 @@ class AlpaoMirror(DeformableMirror):
     stroke_m
         Metres of surface at the actuator for a command of 1; NaN: not known.
     limits
-        Limits of every command.
+        Limits of every command; a table has those that differ from the cautious ones.
     **options
         Fields of :class:`AlpaoOptions`.
 
     Raises
     ------
     ConfigError
-        The serial number is missing or an option is wrong.
+        The serial number is missing, or geometry, limits or an option is wrong.
     """
 
     def __init__(
         self,
-        serial: str,
+        serial: str | int,
         *,
         name: str = "alpao",
         layout: str = "",
         pitch_m: float = 1.5e-3,
         stroke_m: float = math.nan,
-        limits: MirrorLimits = CAUTIOUS_LIMITS,
+        limits: MirrorLimits | Mapping[str, Any] = CAUTIOUS_LIMITS,
         **options: Any,
     ) -> None:
-        super().__init__(name, limits)
+        super().__init__(name, parse_limits(name, limits))
         self._serial, self._options = (
             require_serial("serial", serial),
             parse_options(AlpaoOptions, name, options),
         )
-        self._layout, self._pitch_m, self._stroke_m = layout, pitch_m, stroke_m
+        self._layout = require_geometry(name, layout, pitch_m, stroke_m)
+        self._pitch_m, self._stroke_m = pitch_m, stroke_m
         self._buffer = np.empty(0)
         self._library: AlpaoLibrary | None = None
         self._handle: c_void_p | None = None
@@ -139,7 +141,7 @@ class AlpaoMirror(DeformableMirror):
         self._playing = False
         #: Whether a shape was sent since opening, so that closing has to reset the mirror.
         self._has_moved = False
-        self._info = self._build_info("ALPAO mirror", False) if layout else None
+        self._info = self._build_info(self._layout, "ALPAO mirror", False) if layout else None
 
     @classmethod
     def from_section(cls, section: MirrorConfig, context: DeviceContext) -> Self:
@@ -244,8 +246,7 @@ class AlpaoMirror(DeformableMirror):
         # The buffer never moves, so its address is made once.
         self._buffer = np.zeros(n_act)
         self._transfer = partial(library.c["asdkSend"], handle, c_void_p(self._buffer.ctypes.data))
-        self._layout = layout
-        self._info = self._build_info(f"ALPAO mirror, SDK {version}", library.stand_in, n_act)
+        self._info = self._build_info(layout, f"ALPAO mirror, SDK {version}", library.stand_in, n_act)
 
     def _close(self) -> None:
         library, handle = self._library, self._handle
@@ -312,14 +313,12 @@ class AlpaoMirror(DeformableMirror):
         """True with the stand-in of the SDK, behind which is the simulated bench."""
         return self._info is not None and self._info.simulated
 
-    def _build_info(self, model: str, stand_in: bool, n_act: int = 0) -> DMInfo:
+    def _build_info(self, layout: str, model: str, stand_in: bool, n_act: int = 0) -> DMInfo:
         named = f"{model} (stand-in)" if stand_in else model
-        if not self._layout:
+        if not layout:
             unknown = np.full((n_act, 2), math.nan)
             return DMInfo(named, self._serial, n_act, None, unknown, self._stroke_m, stand_in)
-        return mirror_info(
-            self._layout, self._pitch_m, self._stroke_m, named, self._serial, simulated=stand_in
-        )
+        return mirror_info(layout, self._pitch_m, self._stroke_m, named, self._serial, simulated=stand_in)
 
 
 #: Name of the entry point in version 0.1.0, which an environment installed then still has.

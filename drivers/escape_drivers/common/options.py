@@ -97,17 +97,31 @@ def camera_settings(device: str, section: CameraConfig) -> dict[str, Any]:
     return {"name": device, **{key: getattr(section, key) for key in keys}}
 
 
-def require_serial(where: str, serial: str) -> str:
-    """The serial number without spaces around it; without one, no hardware is opened.
+def serial_text(where: str, serial: str | int) -> str:
+    """A serial number without spaces around it; it may be empty.
 
     Raises
     ------
     ConfigError
-        There is none; ``where`` names the key.
+        It is neither text nor a whole number; ``where`` names the key.
     """
-    if not serial.strip():
+    if isinstance(serial, bool) or not isinstance(serial, str | int):
+        raise ConfigError(f"{where}: {serial!r}  must be text or a whole number")
+    return str(serial).strip()
+
+
+def require_serial(where: str, serial: str | int) -> str:
+    """As :func:`serial_text`; without a serial number, no hardware is opened.
+
+    Raises
+    ------
+    ConfigError
+        There is none.
+    """
+    text = serial_text(where, serial)
+    if not text:
         raise ConfigError(f"{where}: ''  a real device is opened by its serial number only; enter it")
-    return serial.strip()
+    return text
 
 
 def known_layout(n_act: int) -> str:

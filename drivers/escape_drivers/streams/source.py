@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 import numpy as np
 
+from escape_drivers.common.options import serial_text
 from escape_hw.errors import ConfigError, DeviceError, EscapeError
 from escape_hw.io.interchange.milk.stream import MilkStream
 from escape_hw.io.interchange.pyrtc.stream import ShmemStream
@@ -48,7 +49,7 @@ def open_stream(device: str, source: StreamSource, name: str, *, write: bool) ->
     return stream
 
 
-def stream_serial(where: str, serial: str, stream: str) -> str:
+def stream_serial(where: str, serial: str | int, stream: str) -> str:
     """A serial number; without one, the stream's name is used.
 
     Raises
@@ -56,9 +57,10 @@ def stream_serial(where: str, serial: str, stream: str) -> str:
     ConfigError
         No stream is named; ``where`` is the key.
     """
-    if not stream.strip():
+    # A name that is no text is reported with the other options.
+    if not str(stream).strip():
         raise ConfigError(f"{where}: ''  names no stream that could stand for the device; enter it")
-    return serial.strip() or f"stream {stream}"
+    return serial_text("serial", serial) or f"stream {stream}"
 
 
 def with_stream_serial(device: str, section: S, options: Mapping[str, object]) -> S:
