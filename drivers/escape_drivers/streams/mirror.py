@@ -141,7 +141,8 @@ class StreamMirror(DeformableMirror):
             wanted = f"({n_act},)" + ("" if grid is None else f" or {grid.shape}")
             raise DeviceError(
                 self.name,
-                f"stream '{stream.name}' has shape {stream.shape}; the layout {layouts.shorten(layout)!r} needs {wanted}",
+                f"stream '{stream.name}' has shape {stream.shape}; "
+                f"the layout {layouts.shorten(layout)!r} needs {wanted}",
             )
         self._scaled_command, self._buffer = np.zeros(n_act), np.zeros(stream.shape)
         self._flat_buffer = self._buffer.reshape(-1)
