@@ -168,8 +168,8 @@ class AlpaoMirror(DeformableMirror):
         With ``trigger_in`` each edge brings the next shape. Nothing is clipped here: a sequence that
         breaks a limit anywhere, from the present shape on and from its end to its beginning, is
         refused as a whole. The electronics do not tell which shape they have reached: until the next
-        command the slew rule is obeyed from all of them, see :meth:`CommandGuard.mark_sequence
-        <escape_hw.safety.guard.CommandGuard.mark_sequence>`.
+        command :attr:`shape` is one of them, and the slew rule is obeyed from all, see
+        :meth:`CommandGuard.mark_sequence <escape_hw.safety.guard.CommandGuard.mark_sequence>`.
 
         Parameters
         ----------
