@@ -6,7 +6,6 @@ import inspect
 import logging
 import zlib
 from collections.abc import Mapping
-from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self, TypeVar
@@ -27,13 +26,12 @@ from escape_hw.config.devices import (
     CameraConfig,
     CameraOrientation,
     DeviceConfig,
-    LimitsConfig,
     MirrorConfig,
     MirrorOrientation,
     SensorCameraConfig,
     hardware_order,
 )
-from escape_hw.config.options import parse_options
+from escape_hw.config.options import parse_limits, parse_options
 from escape_hw.config.registry import (
     DeviceContext,
     call_factory,
@@ -45,7 +43,7 @@ from escape_hw.config.section import Section
 from escape_hw.config.system import SystemConfig
 from escape_hw.deprecation import renamed_members
 from escape_hw.errors import ConfigError, NotOpen, ProductError
-from escape_hw.safety.limits import CAUTIOUS_LIMITS, MirrorLimits, nearest_pairs
+from escape_hw.safety.limits import nearest_pairs
 
 if TYPE_CHECKING:
     from threadpoolctl import _ThreadpoolLimiter
@@ -293,8 +291,8 @@ def build_standalone_device(driver: str, kind: type[D], /, **settings: Any) -> D
     """
     made_by = device_class(driver)
     _require_arguments(driver, made_by, settings)
-    if issubclass(made_by, DeformableMirror) and "limits" in settings:
-        settings["limits"] = _parse_limits(f"{driver}.limits", settings["limits"])
+    if issubclass(made_by, DeformableMirror) and settings.get("limits") is not None:
+        settings["limits"] = parse_limits(driver, settings["limits"])
     turned_by = _orientation_keys(made_by)
     given = {key: settings.pop(key) for key in turned_by.model_fields if key in settings}
     orientation = parse_options(turned_by, driver, given)
@@ -326,18 +324,6 @@ def _require_arguments(driver: str, made_by: type[Device], settings: Mapping[str
                 f"driver '{driver}' needs {name}, which is missing; give {name}=..., on the command line "
                 f"{option}"
             )
-
-
-def _parse_limits(where: str, limits: object) -> MirrorLimits | None:
-    """Limits, or a table of those that differ from the cautious ones; ``None``: those of the driver."""
-    if limits is None or isinstance(limits, MirrorLimits):
-        return limits
-    if not isinstance(limits, Mapping):
-        raise ConfigError(
-            f"{where}: {limits!r}  must be a table, such as {{'max_stroke': 0.3}}, on the command line "
-            "--set limits.max_stroke=0.3"
-        )
-    return parse_options(LimitsConfig, where, {**asdict(CAUTIOUS_LIMITS), **limits}).to_limits()
 
 
 def _order_of(driver: str, mirror: DeformableMirror, order: str) -> NDArray[np.intp] | None:

@@ -139,6 +139,7 @@ class AcmeCamera(escape_hw.Camera):
 
     def _open(self) -> None:
         self._sensor = AcmeSensor(self._options.black_level)  # load the vendor library here
+        self._require_valid(self._settings)
         self._configure(self._check(self._settings))
 
     def _close(self) -> None:

@@ -137,12 +137,10 @@ class DeformableMirror(Device):
         CommandRejected
             The command is malformed or breaks a limit other than slew.
         """
-        guard = self._guard_when_open()
-        wanted = guard.validate(command)
-        violation = guard.find_violation(wanted)
+        violation = self.find_violation(command)
         if violation is not None:
             raise CommandRejected(self.name, f"flat command rejected: {violation}")
-        self._flat = wanted
+        self._flat = self._guard_when_open().validate(command)
 
     @final
     def send(self, command: ArrayLike) -> SendReport:
@@ -194,6 +192,18 @@ class DeformableMirror(Device):
     def is_legal(self, command: NDArray[np.float64]) -> bool:
         """Whether :meth:`send` would send a shape ``(n_act,)`` unchanged; sends nothing."""
         return self._guard_when_open().is_legal(command)
+
+    @final
+    def find_violation(self, command: ArrayLike) -> str | None:
+        """Message for the first rule other than slew that a command ``(n_act,)`` breaks, or ``None``.
+
+        Raises
+        ------
+        CommandRejected
+            The command is malformed.
+        """
+        guard = self._guard_when_open()
+        return guard.find_violation(guard.validate(command))
 
     @final
     def largest_legal_scale(self, command: ArrayLike) -> float:
@@ -256,6 +266,12 @@ class DeformableMirror(Device):
             raise SettingRejected(
                 self.name,
                 f"order has {self.order.size} numbers; it must have each of 0 to {info.n_act - 1} once",
+            )
+        if self._flat is not None and self._flat.size != info.n_act:
+            raise SettingRejected(
+                self.name,
+                f"its flat shape is of {self._flat.size} actuators, and it has {info.n_act}; "
+                "make a new object for another mirror",
             )
         present = self._present_in_layout()
         guard.reset(present)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import asdict
 from typing import Any, TypeVar
 
 import numpy as np
@@ -10,9 +11,11 @@ from pydantic import ValidationError
 from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
+from escape_hw.config.devices import LimitsConfig
 from escape_hw.config.key_tree import closest_match, fields_of, format_path, range_text, sections_of
 from escape_hw.config.section import RULE_ERROR, Section
 from escape_hw.errors import ConfigError
+from escape_hw.safety.limits import CAUTIOUS_LIMITS, MirrorLimits
 
 Options = TypeVar("Options", bound=Section)
 
@@ -45,6 +48,24 @@ def parse_options(
         raise ConfigError(
             "\n".join(line for detail in details for line in _describe(kind, where, detail, also))
         ) from None
+
+
+def parse_limits(device: str, limits: MirrorLimits | Mapping[str, Any]) -> MirrorLimits:
+    """Limits of a mirror; a table has those that differ from the cautious ones.
+
+    Raises
+    ------
+    ConfigError
+        A limit is unknown or out of range.
+    """
+    if isinstance(limits, MirrorLimits):
+        return limits
+    if not isinstance(limits, Mapping):
+        raise ConfigError(
+            f"{device}.limits: {limits!r}  must be MirrorLimits or a table such as {{'max_stroke': 0.3}}, on the "
+            "command line --set limits.max_stroke=0.3"
+        )
+    return parse_options(LimitsConfig, f"{device}.limits", {**asdict(CAUTIOUS_LIMITS), **limits}).to_limits()
 
 
 def _plain(value: Any) -> Any:

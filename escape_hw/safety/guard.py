@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -159,6 +160,21 @@ class CommandGuard:
         """
         lowest, highest = (self.last, self.last) if self._possible is None else self._possible
         self._possible = np.minimum(lowest, shape), np.maximum(highest, shape)
+
+    def mark_sequence(self, shapes: Sequence[NDArray[np.float64]]) -> None:
+        """Store legal shapes that the mirror takes one after the other by itself: it may have any of them.
+
+        As :meth:`mark_uncertain` of each; the last shape becomes the one of them from which the farthest
+        possible shape is least far. The first step after a sequence is within the slew rule if a shape of the
+        sequence is that close to all others, and otherwise leads there.
+        """
+        for shape in shapes:
+            self.mark_uncertain(shape)
+        assert self._possible is not None
+        lowest, highest = self._possible
+        # The last one of those that are equally good, because a sequence often has ended.
+        central = min(reversed(shapes), key=lambda shape: max(_peak(shape - lowest), _peak(highest - shape)))
+        self.last = _read_only(central.copy())
 
     def __call__(self, command: ArrayLike) -> tuple[NDArray[np.float64], GuardReport]:
         """:meth:`limit`, then :meth:`set_last`."""

@@ -95,3 +95,26 @@ def test_a_shape_beyond_reach_of_an_uncertain_one_is_not_legal() -> None:
     assert guard.limit([0.5])[0] == pytest.approx(0.1)
     guard.reset([0.0])
     assert guard.is_legal(np.array([-0.05]))
+
+
+@settings(max_examples=100, deadline=None)
+@given(limits=LIMITS, n_shapes=st.integers(1, 8), seed=st.integers(0, 2**32 - 1))
+def test_the_first_step_after_a_sequence_is_as_short_as_its_shapes_allow(
+    limits: MirrorLimits, n_shapes: int, seed: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    guard = CommandGuard("dm", N, limits)
+    possible = [guard.last]
+    for _ in range(n_shapes):
+        possible.append(guard(rng.choice([0.05, 1.0]) * rng.standard_normal(N))[0])
+    guard.reset(possible[0])
+    guard.mark_sequence(possible[1:])
+
+    def farthest(shape: NDArray[np.float64]) -> float:
+        return max(float(np.abs(shape - other).max()) for other in possible)
+
+    assert limits.max_slew is not None
+    sent, _ = guard(rng.standard_normal(N))
+    assert farthest(sent) <= max(limits.max_slew, min(map(farthest, possible[1:]))) + 1e-9
+    guard(rng.standard_normal(N))
+    assert np.abs(guard.last - sent).max() <= limits.max_slew + 1e-9

@@ -12,7 +12,8 @@ from escape_drivers.alpao.library import ERRORS, describe_error, format_version
 from escape_drivers.alpao.mirror import AlpaoMirror
 from escape_hw.bench import build_device
 from escape_hw.config.registry import available
-from escape_hw.errors import CommandRejected, ConfigError, DeviceError, DeviceLost
+from escape_hw.errors import CommandRejected, ConfigError, DeviceError, DeviceLost, SettingRejected
+from escape_hw.safety.limits import MirrorLimits
 
 OPENING = ["asdkInit SIM97", "asdkGet NbOfActuator", "asdkGet VersionInfo", "asdkSet TriggerIn 0"]
 CLOSING = ["asdkStop", "asdkReset", "asdkRelease"]
@@ -69,6 +70,25 @@ def test_a_trigger_that_another_program_left_on_is_switched_off(asdk) -> None:
     assert not asdk.violations
 
 
+@pytest.mark.parametrize("number", [0x010, 0x032, 0x10A])
+def test_electronics_without_a_trigger_need_not_be_told_that_it_is_off(asdk, number) -> None:
+    asdk.script(f"asdkSet 1 error {number:#x}")
+    with make("alpao") as dm:
+        assert dm.is_open
+
+
+@pytest.mark.parametrize(
+    ("fault", "why"),
+    [("error 0x104", "0x104, output failed.*check power"), ("timeout 1", "0x10D"), ("error 0", "no reason")],
+)
+def test_a_trigger_that_cannot_be_switched_off_is_no_open_mirror(asdk, fault, why) -> None:
+    asdk.script(f"asdkSet 1 {fault}")
+    with pytest.raises(DeviceError, match=rf"asdkSet\(TriggerIn, 0\) failed.*{why}"):
+        make("alpao").open()
+    assert asdk.names()[-2:] == ["asdkSet", "asdkRelease"]
+    assert not asdk.violations
+
+
 def test_triggered_sequences_follow_each_other_and_closing_waits_for_no_edge(asdk) -> None:
     rows = np.zeros((3, 97))
     rows[1] = 0.01
@@ -82,6 +102,19 @@ def test_triggered_sequences_follow_each_other_and_closing_waits_for_no_edge(asd
             dm.send(rows[1])
     assert asdk.names()[-3:] == CLOSING
     assert not asdk.shape(97).any()
+    assert not asdk.violations
+
+
+@pytest.mark.parametrize("repeats", [0, 1])
+def test_closing_stops_a_triggered_sequence_before_it_switches_the_trigger_off(asdk, repeats) -> None:
+    rows = np.zeros((3, 97))
+    rows[1] = 0.01
+    with make("alpao", "devices.dm.options.trigger_in=rising") as dm:
+        dm.play_patterns(rows, repeats)
+        n_before = len(asdk.calls)
+    closing = [line for line in asdk.calls[n_before:] if not line.startswith("asdkSend")]
+    assert closing == ["asdkStop", "asdkSet TriggerIn 0", *CLOSING]
+    assert "asdkSend" in asdk.names()[n_before:], "it is ramped flat, not only reset"
     assert not asdk.violations
 
 
@@ -146,11 +179,22 @@ def test_a_failure_without_a_reason_is_one(asdk) -> None:
 
 
 def test_a_wrong_number_of_actuators_is_refused(asdk) -> None:
-    asdk.script("set actuators 277")
+    dm = make("alpao")
+    with dm:
+        dm.send(np.full(97, 0.1))
+    asdk.clear().script("set actuators 277")
     with pytest.raises(DeviceError, match="has 277 actuators, but the layout 'circle-11' has 97"):
-        make("alpao").open()
+        dm.open()
     assert asdk.calls[-1] == "asdkRelease"
     assert "asdkReset" not in asdk.calls, "nothing had moved"
+
+
+def test_limits_that_do_not_fit_the_mirror_leave_it_as_it_was(asdk) -> None:
+    dm = AlpaoMirror("SIM97", library=str(asdk.path), limits=MirrorLimits(disabled=(97,)))
+    with pytest.raises(SettingRejected, match=r"disabled actuators \(97,\) do not all lie in 0\.\.96"):
+        dm.open()
+    assert asdk.calls == [*OPENING, "asdkRelease"]
+    assert not asdk.violations
 
 
 def test_one_mirror_has_one_owner(asdk) -> None:
@@ -211,6 +255,31 @@ def test_a_pattern_that_breaks_a_limit_anywhere_is_refused_whole(asdk) -> None:
         with pytest.raises(CommandRejected, match=r"not finite|NaN|nan"):
             dm.play_patterns(still * np.nan)
         assert asdk.names().count("asdkSendPattern") == 1
+
+
+def test_a_refused_pattern_leaves_the_shapes_that_the_mirror_may_have(asdk) -> None:
+    with make("alpao", "devices.dm.limits.max_slew=0.1") as dm:
+        dm.flatten()
+        asdk.script("asdkSend 2 unacknowledged")
+        with pytest.raises(DeviceError, match="error 0x10D"):
+            dm.send(np.full(97, 0.1))
+        with pytest.raises(CommandRejected, match="exceeds max_stroke"):
+            dm.play_patterns(np.full((2, 97), 0.9))
+        assert not dm.send(np.full(97, -0.1)).sent.any(), "the mirror may have 0.1"
+
+
+@pytest.mark.parametrize("repeats", [0, 1])
+@pytest.mark.parametrize("wanted", [-0.5, 0.5])
+def test_the_step_after_a_sequence_is_within_the_slew_rule_from_all_its_shapes(asdk, repeats, wanted) -> None:
+    rows, shape = np.zeros((4, 97)), np.zeros(97)
+    rows[:, 5], shape[5] = [0.0, 0.1, 0.2, 0.1], wanted
+    with make("alpao", "devices.dm.limits.max_slew=0.1") as dm:
+        dm.play_patterns(rows, repeats)
+        assert dm.send(shape).sent[5] == pytest.approx(0.1)
+        assert np.abs(asdk.shape(97) - rows).max() <= 0.1 + 1e-12
+        assert dm.send(shape).sent[5] == pytest.approx(0.1 + np.copysign(0.1, wanted)), "known again"
+        with pytest.raises(CommandRejected, match=r"shape 0 .* that the mirror may have; flatten"):
+            dm.play_patterns([np.full(97, 0.2)])
 
 
 @settings(max_examples=60, deadline=None)

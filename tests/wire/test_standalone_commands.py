@@ -75,6 +75,13 @@ def test_a_mirror_of_an_unknown_arrangement_is_flattened_and_poked(escape, caplo
 @pytest.mark.parametrize(
     ("words", "code", "message"),
     [
+        (["poke", "0", "0.3"], 3, "with the other actuators flat (max_slew = 0.2); choose"),
+        (["poke", "0", "0.6"], 3, "0.2 with the other actuators flat (actuator 0 exceeds max_stroke = 0.5"),
+        (
+            ["poke", "0", "0.1", "--set", "limits.max_abs_sum=0.01"],
+            3,
+            "allow 0.01 with the other actuators flat (the sum of magnitudes exceeds max_abs_sum = 0.01",
+        ),
         (["poke", "97", "0.1"], 3, "actuator 97 does not exist; the mirror has 0 to 96"),
         (["poke", "0", "0.6"], 3, "a poke of 0.6 at actuator 0 is beyond its limits"),
         (["flat", "--mode", "sim"], 2, "not with --driver"),

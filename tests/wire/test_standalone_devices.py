@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,9 +17,10 @@ from escape_drivers.aravis import AravisCamera
 from escape_drivers.asm import AsmMirror
 from escape_drivers.common.options import known_layout
 from escape_drivers.pi import PiModulator
+from escape_drivers.streams import MilkMirror
 from escape_drivers.ximea import XimeaCamera
 from escape_hw.api.adaptive_secondary import ShellState
-from escape_hw.config.layouts import layout_map
+from escape_hw.config.layouts import layout_map, positions
 from escape_hw.config.loader import load_system
 from escape_hw.errors import ConfigError, DeviceError, NotOpen, SettingRejected
 from escape_hw.safety.limits import CAUTIOUS_LIMITS
@@ -96,6 +98,65 @@ def test_actuators_of_an_unknown_arrangement_are_all_neighbours(caplog: pytest.L
             sent = dm.send(shape).sent
         assert np.ptp(sent) <= 0.4 + 1e-9
     assert not stand_in("asdk").violations
+
+
+def test_a_layout_may_be_a_file(tmp_path: Path) -> None:
+    grid = layout_map("circle-11")
+    np.savetxt(tmp_path / "mask.txt", grid, fmt="%d")
+    np.savetxt(tmp_path / "positions.txt", positions("maps-336"))
+    with mirror(layout=f"mask:{tmp_path}/mask.txt") as dm:
+        assert np.array_equal(dm.info.layout, grid)
+    with emulator() as made:
+        words = {"port": port_of(made), "layout": f"positions:{tmp_path}/positions.txt", "pitch_m": 0.03}
+        with AsmMirror("SIM336", reply_s=10.0, **words) as device:
+            np.testing.assert_allclose(device.info.positions_m, 0.03 * positions("maps-336"), atol=1e-9)
+
+
+def test_a_mirror_opened_again_may_be_another_one() -> None:
+    dm = mirror()
+    for n_act, rows in ((97, 11), (69, 9), (192, 0)):
+        stand_in("asdk").script(f"set actuators {n_act}")
+        with dm:
+            assert dm.info.n_act == n_act
+            assert (0 if dm.info.layout is None else len(dm.info.layout)) == rows
+    stand_in("asdk").script("set actuators 97")
+    with dm:
+        dm.set_flat(np.full(97, 0.01))
+    stand_in("asdk").script("set actuators 69")
+    with pytest.raises(SettingRejected, match="its flat shape is of 97 actuators, and it has 69; make a new"):
+        dm.open()
+    assert not stand_in("asdk").violations
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"layout": "circle-x"}, "layout: layout 'circle-x' is unknown; choose 'circle-N', .* 'mask:FILE'"),
+        ({"layout": "mask:/nowhere"}, "layout: the mask '/nowhere' cannot be read .No such file"),
+        ({"pitch_m": "1.5e-3"}, "pitch_m: '1.5e-3'  must be a valid number .allowed range 0 < x <= 1"),
+        ({"pitch_m": -1.5e-3}, "pitch_m: -0.0015  is out of range .allowed range 0 < x <= 1"),
+        ({"pitch_m": math.nan}, "pitch_m: nan  must be a finite number"),
+        ({"stroke_m": 0}, "stroke_m: 0  is out of range .allowed range 0 < x <= 0.001"),
+        ({"stroke_m": "3e-6"}, "stroke_m: '3e-6'  must be a valid number"),
+        ({"limits": {"max_stork": 0.1}}, "limits.max_stork: unknown option .did you mean 'max_stroke'"),
+        ({"limits": {"max_stroke": "0.1"}}, "limits.max_stroke: '0.1'  must be a valid number"),
+        ({"limits": 0.1}, "limits: 0.1  must be MirrorLimits or a table"),
+        ({"serial": None}, "^serial: None  must be text or a whole number"),
+    ],
+)
+@pytest.mark.parametrize("kind", [AlpaoMirror, AsmMirror, MilkMirror])
+def test_geometry_and_limits_are_checked_before_a_mirror_is_opened(kind, wrong, message) -> None:
+    words = {"stream": "s"} if kind is MilkMirror else {}
+    with pytest.raises(ConfigError, match=message):
+        kind(**{"serial": "1", "name": "dm", **words, **wrong})
+
+
+def test_a_mirror_used_alone_takes_a_table_of_limits_and_a_whole_serial_number() -> None:
+    fresh("asdk", "set serial 118")
+    with AlpaoMirror(118, library=str(stand_in("asdk").path), limits={"max_stroke": 0.1}) as dm:
+        assert (dm.info.serial, dm.limits) == ("118", replace(CAUTIOUS_LIMITS, max_stroke=0.1))
+    assert AsmMirror(336, limits={"max_stroke": 0.1}).limits == replace(CAUTIOUS_LIMITS, max_stroke=0.1)
+    assert AsmMirror(336).limits is CAUTIOUS_LIMITS
 
 
 def test_the_guard_limits_every_command_of_a_mirror_used_alone() -> None:

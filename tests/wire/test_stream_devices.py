@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from streams import PERIOD_S, SHAPE, camera_config, create, mirror_config, published, ramp
 
+from escape_drivers.streams import MilkMirror, PyrtcMirror
 from escape_drivers.streams import camera as stream_camera
 from escape_hw.bench import open_device
 from escape_hw.config.loader import load_system
@@ -200,3 +201,21 @@ def test_the_folder_of_images_is_milks(tmp_path: Path, monkeypatch: pytest.Monke
     assert shm_folder() == tmp_path
     monkeypatch.setenv("MILK_SHM_DIR", str(tmp_path / "nowhere"))
     assert shm_folder() != tmp_path / "nowhere"
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_mirror_used_alone_has_the_layout_of_a_file_or_of_the_stream(kind: str, tmp_path: Path) -> None:
+    np.savetxt(tmp_path / "mask.txt", np.ones((2, 3)), fmt="%d")
+    name, mirror = f"{TAG}_alone", {"milk": MilkMirror, "pyrtc": PyrtcMirror}[kind]
+    alone = mirror(name)
+    for n_act, rows in ((97, 11), (69, 9)):
+        stream: Any = create(kind, name, (n_act,), "f4")
+        try:
+            with alone:
+                assert alone.info.layout is not None
+                assert (alone.info.n_act, len(alone.info.layout)) == (n_act, rows)
+        finally:
+            stream.unlink()
+            stream.close()
+    given = mirror(name, layout=f"mask:{tmp_path}/mask.txt")
+    assert (given.info.n_act, given.info.layout.shape) == (6, (2, 3))

@@ -64,6 +64,9 @@ def describe_error(number: int, text: str) -> str:
     return f"error 0x{number:X}, {meaning}{library_text}{'; ' if remedy else ''}{remedy}"
 
 
+#: Errors of a parameter that this SDK, interface or electronics do not have.
+_NOT_SUPPORTED = frozenset({0x010, 0x032, 0x10A})
+
 SDK = VendorLibrary(
     "ALPAO SDK", ("libasdk.so",), "ESCAPE_ALPAO_LIBRARY", "install the SDK that came with the mirror"
 )
@@ -125,7 +128,9 @@ class AlpaoLibrary(LoadedLibrary):
 
     def error_for(self, call: str) -> DeviceError:
         """The error to raise after a call that failed."""
-        error = self.last_error()
+        return self._describe_failure(call, self.last_error())
+
+    def _describe_failure(self, call: str, error: tuple[int, str] | None) -> DeviceError:
         if error is None:
             return DeviceError(self.device, f"{call} failed; the SDK gives no reason")
         return self._error(error[0], f"{call} failed: {describe_error(*error)}")
@@ -142,10 +147,13 @@ class AlpaoLibrary(LoadedLibrary):
             raise self.error_for(f"asdkGet({name})")
         return value.value
 
-    def set(self, handle: c_void_p, name: str, value: float) -> None:
-        """Write a parameter."""
-        if self.c.asdkSet(handle, name.encode(), value) != 0:
-            raise self.error_for(f"asdkSet({name}, {value:g})")
+    def set(self, handle: c_void_p, name: str, value: float, *, if_supported: bool = False) -> None:
+        """Write a parameter; with ``if_supported``, unless the SDK or the electronics do not have it."""
+        if self.c.asdkSet(handle, name.encode(), value) == 0:
+            return
+        error = self.last_error()
+        if not (if_supported and error is not None and error[0] in _NOT_SUPPORTED):
+            raise self._describe_failure(f"asdkSet({name}, {value:g})", error)
 
 
 def format_version(number: float) -> str:

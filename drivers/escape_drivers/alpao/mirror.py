@@ -5,7 +5,8 @@ from __future__ import annotations
 import logging
 import math
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from copy import copy
 from ctypes import c_void_p
 from functools import partial
 from typing import TYPE_CHECKING, Any, Literal, Self
@@ -15,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
 from escape_drivers.alpao.library import AlpaoLibrary, format_version
+from escape_drivers.common.mirror import require_geometry
 from escape_drivers.common.options import (
     keywords_of,
     known_layout,
@@ -25,9 +27,9 @@ from escape_drivers.common.options import (
 from escape_hw.api.mirror import DeformableMirror, DMInfo
 from escape_hw.config.devices import mirror_info
 from escape_hw.config.layouts import n_actuators, shorten
-from escape_hw.config.options import parse_options
+from escape_hw.config.options import parse_limits, parse_options
 from escape_hw.config.section import Section
-from escape_hw.errors import CommandRejected, DeviceError, DeviceLost, NotOpen
+from escape_hw.errors import CommandRejected, DeviceError, NotOpen
 from escape_hw.safety.limits import CAUTIOUS_LIMITS, MirrorLimits
 
 if TYPE_CHECKING:
@@ -105,14 +107,14 @@ class AlpaoMirror(DeformableMirror):
     stroke_m
         Metres of surface at the actuator for a command of 1; NaN: not known.
     limits
-        Limits of every command.
+        Limits of every command; a table has those that differ from the cautious ones.
     **options
         Fields of :class:`AlpaoOptions`.
 
     Raises
     ------
     ConfigError
-        The serial number is missing or an option is wrong.
+        The serial number is missing, or geometry, limits or an option is wrong.
     """
 
     def __init__(
@@ -123,22 +125,25 @@ class AlpaoMirror(DeformableMirror):
         layout: str = "",
         pitch_m: float = 1.5e-3,
         stroke_m: float = math.nan,
-        limits: MirrorLimits = CAUTIOUS_LIMITS,
+        limits: MirrorLimits | Mapping[str, Any] = CAUTIOUS_LIMITS,
         **options: Any,
     ) -> None:
-        super().__init__(name, limits)
+        super().__init__(name, parse_limits(name, limits))
         self._serial, self._options = (
             # Configuration files have names in capitals, and the SDK searches for capitals.
             require_serial("serial", serial).upper(),
             parse_options(AlpaoOptions, name, options, keywords_of(type(self))),
         )
-        self._layout, self._pitch_m, self._stroke_m = layout, pitch_m, stroke_m
+        self._layout = require_geometry(name, layout, pitch_m, stroke_m)
+        self._pitch_m, self._stroke_m = pitch_m, stroke_m
         self._buffer = np.empty(0)
         self._library: AlpaoLibrary | None = None
         self._handle: c_void_p | None = None
         self._transfer: Callable[[], int] = _raise_not_connected
         self._playing = False
-        self._info = self._build_info("ALPAO mirror", False) if layout else None
+        #: Whether a shape was sent since opening, so that closing has to reset the mirror.
+        self._has_moved = False
+        self._info = self._build_info(self._layout, "ALPAO mirror", False) if layout else None
 
     @classmethod
     def from_section(cls, section: MirrorConfig, context: DeviceContext) -> Self:
@@ -164,7 +169,9 @@ class AlpaoMirror(DeformableMirror):
 
         With ``trigger_in`` each edge brings the next shape. Nothing is clipped here: a sequence that
         breaks a limit anywhere, from the present shape on and from its end to its beginning, is
-        refused as a whole.
+        refused as a whole. The electronics do not tell which shape they have reached: until the next
+        command :attr:`shape` is one of them, and the slew rule is obeyed from all, see
+        :meth:`CommandGuard.mark_sequence <escape_hw.safety.guard.CommandGuard.mark_sequence>`.
 
         Parameters
         ----------
@@ -186,27 +193,22 @@ class AlpaoMirror(DeformableMirror):
             self._stop_playing()
             library, handle = self._require_connected()
             # The mirror's shape is unknown from here on, also if the call fails: the next flatten() sends.
-            self._playing, self._shape_known = True, False
+            self._playing = self._has_moved = True
+            self._shape_known = False
+            self._guard_when_open().mark_sequence(sequence)
             pointer = c_void_p(in_hardware.ctypes.data)
             library.call("asdkSendPattern", handle, pointer, len(sequence), repeats)
-            self._guard_when_open().reset(sequence[-1])
 
-    def _set_trigger(self, library: AlpaoLibrary, handle: c_void_p, trigger_in: str) -> None:
+    def _set_trigger(self, trigger_in: str) -> None:
         """Set the trigger's edge; electronics without triggers need no "off"."""
-        try:
-            library.set(handle, "TriggerIn", _TRIGGER_IN[trigger_in])
-        except DeviceLost:
-            raise
-        except DeviceError as error:
-            if trigger_in != "off":
-                raise
-            log.debug("%s: has no trigger (%s)", self.name, error)
+        library, handle = self._require_connected()
+        library.set(handle, "TriggerIn", _TRIGGER_IN[trigger_in], if_supported=trigger_in == "off")
 
     def _before_close(self) -> None:
-        """Without the trigger, so that the flat shape waits for no edge."""
-        library, handle = self._require_connected()
+        """Without the trigger, so that the ramp to flat waits for no edge; first of all, a sequence stops."""
+        self._stop_playing(arm_again=False)
         if self._options.is_triggered:
-            self._set_trigger(library, handle, "off")
+            self._set_trigger("off")
         super()._before_close()
 
     def stop_pattern(self) -> None:
@@ -216,6 +218,7 @@ class AlpaoMirror(DeformableMirror):
             self._stop_playing()
 
     def _open(self) -> None:
+        self._playing = self._has_moved = False
         if self._options.config_folder:
             os.environ[_CONFIG_VARIABLE] = self._options.config_folder
         library = self._library = AlpaoLibrary(self.name, self._options.library)
@@ -238,15 +241,13 @@ class AlpaoMirror(DeformableMirror):
         log.info("%s: SDK %s, mirror %s", self.name, version, self._serial)
         for name, value in self._options.sdk_parameters():
             library.set(handle, name, value)
-        self._set_trigger(library, handle, self._options.trigger_in or "off")
-        self._playing = False
+        self._set_trigger(self._options.trigger_in or "off")
         # A function object of its own without prototype: both arguments are C pointers for good already,
         # and checking them at every call costs as much as the call.
         # The buffer never moves, so its address is made once.
         self._buffer = np.zeros(n_act)
         self._transfer = partial(library.c["asdkSend"], handle, c_void_p(self._buffer.ctypes.data))
-        self._layout = layout
-        self._info = self._build_info(f"ALPAO mirror, SDK {version}", library.stand_in, n_act)
+        self._info = self._build_info(layout, f"ALPAO mirror, SDK {version}", library.stand_in, n_act)
 
     def _close(self) -> None:
         library, handle = self._library, self._handle
@@ -254,7 +255,8 @@ class AlpaoMirror(DeformableMirror):
         self._playing, self._transfer = False, _raise_not_connected
         if library is None or handle is None:
             return
-        for name in ("asdkStop", "asdkReset", "asdkRelease"):
+        # After a failed opening, or if nothing could be sent, the mirror keeps the shape that it had.
+        for name in (*(("asdkStop", "asdkReset") if self._has_moved else ()), "asdkRelease"):
             try:
                 library.call(name, handle)
             except DeviceError as error:
@@ -262,48 +264,45 @@ class AlpaoMirror(DeformableMirror):
                 log.warning("while closing: %s", error)
 
     def _release_after_failed_open(self) -> None:
-        """Release a mirror that was opened in vain; nothing has moved, so nothing is reset."""
-        library, handle = self._library, self._handle
-        self._library = self._handle = None
-        if library is not None and handle is not None:
-            library.call("asdkRelease", handle)
+        self._close()
 
     def _send(self, command: NDArray[np.float64]) -> None:
         if self._playing:
             self._stop_playing()
+        self._has_moved = True
         self._buffer[:] = command
         if self._transfer() != 0:
             raise self._require_connected()[0].error_for("asdkSend")
 
-    def _stop_playing(self) -> None:
+    def _stop_playing(self, *, arm_again: bool = True) -> None:
+        if not self._playing:
+            return
         library, handle = self._require_connected()
-        if self._playing:
-            library.call("asdkStop", handle)
-            self._playing = False
-            if self._options.is_triggered:
-                # Users report that a second triggered sequence fails (0x102, 0x104) without this.
-                self._set_trigger(library, handle, "off")
-                self._set_trigger(library, handle, self._options.trigger_in)
+        library.call("asdkStop", handle)
+        self._playing = False
+        if arm_again and self._options.is_triggered:
+            # Users report that a second triggered sequence fails (0x102, 0x104) without this.
+            self._set_trigger("off")
+            self._set_trigger(self._options.trigger_in)
 
-    def _validate_sequence(self, patterns: ArrayLike, repeats: int) -> NDArray[np.float64]:
-        guard = self._guard_when_open()
+    def _validate_sequence(self, patterns: ArrayLike, repeats: int) -> list[NDArray[np.float64]]:
+        # A copy follows the sequence: a refused one changes nothing that is known of the mirror's shape.
+        guard = copy(self._guard_when_open())
         rows = [guard.validate(row) for row in np.asarray(patterns)]
         if not rows or repeats < 0:
             raise CommandRejected(
                 self.name, f"{len(rows)} shapes, {repeats} repeats; need one and none below 0"
             )
         cyclic_rows = rows if repeats == 1 else [*rows, rows[0]]
-        last = guard.last
-        try:
-            for number, row in enumerate(cyclic_rows):
-                if not guard.is_legal(row):
-                    slew_message = f"is further from the one before than max_slew = {self.limits.max_slew}"
-                    why = guard.find_violation(row) or slew_message
-                    raise CommandRejected(self.name, f"shape {number % len(rows)} of the sequence: {why}")
-                guard.set_last(row)
-        finally:
-            guard.set_last(last)
-        return np.ascontiguousarray(rows)
+        slew = f"max_slew = {self.limits.max_slew}"
+        too_far = f"is further than {slew} from a shape that the mirror may have; flatten() first"
+        for number, row in enumerate(cyclic_rows):
+            if not guard.is_legal(row):
+                why = guard.find_violation(row) or too_far
+                raise CommandRejected(self.name, f"shape {number % len(rows)} of the sequence: {why}")
+            guard.set_last(row)
+            too_far = f"is further from the one before than {slew}"
+        return rows
 
     def _require_connected(self) -> tuple[AlpaoLibrary, c_void_p]:
         if self._library is None or self._handle is None:
@@ -315,14 +314,12 @@ class AlpaoMirror(DeformableMirror):
         """True with the stand-in of the SDK, behind which is the simulated bench."""
         return self._info is not None and self._info.simulated
 
-    def _build_info(self, model: str, stand_in: bool, n_act: int = 0) -> DMInfo:
+    def _build_info(self, layout: str, model: str, stand_in: bool, n_act: int = 0) -> DMInfo:
         named = f"{model} (stand-in)" if stand_in else model
-        if not self._layout:
+        if not layout:
             unknown = np.full((n_act, 2), math.nan)
             return DMInfo(named, self._serial, n_act, None, unknown, self._stroke_m, stand_in)
-        return mirror_info(
-            self._layout, self._pitch_m, self._stroke_m, named, self._serial, simulated=stand_in
-        )
+        return mirror_info(layout, self._pitch_m, self._stroke_m, named, self._serial, simulated=stand_in)
 
 
 #: Name of the entry point in version 0.1.0, which an environment installed then still has.

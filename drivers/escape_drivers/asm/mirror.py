@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Self
 
@@ -17,6 +17,7 @@ from escape_drivers.asm.codec import AsmCodec
 from escape_drivers.asm.link import AsmLink, MirrorRefusal
 from escape_drivers.asm.messages import Welcome
 from escape_drivers.asm.options import EMULATOR, AsmOptions
+from escape_drivers.common.mirror import require_geometry
 from escape_drivers.common.options import (
     keywords_of,
     layout_of,
@@ -29,7 +30,7 @@ from escape_hw.api.emulator import Emulator, EmulatorRequest
 from escape_hw.api.mirror import DMInfo
 from escape_hw.config.devices import mirror_info
 from escape_hw.config.layouts import n_actuators, shorten
-from escape_hw.config.options import parse_options
+from escape_hw.config.options import parse_limits, parse_options
 from escape_hw.config.registry import emulator_factory
 from escape_hw.errors import DeviceError, NotOpen, SettingRejected
 from escape_hw.safety.limits import CAUTIOUS_LIMITS, MirrorLimits
@@ -160,7 +161,8 @@ class AsmMirror(AdaptiveSecondary):
     name
         Name in messages.
     layout, pitch_m, stroke_m, limits
-        As in :class:`ExpectedMirror`; by default as the mirror reports.
+        As in :class:`ExpectedMirror`; by default as the mirror reports. A table of limits has those that
+        differ from the cautious ones.
     make_codec
         Makes the codec of a connection; the observatory's own goes here.
     emulator
@@ -171,7 +173,7 @@ class AsmMirror(AdaptiveSecondary):
     Raises
     ------
     ConfigError
-        The serial number is missing or an option is wrong.
+        The serial number is missing, or geometry, limits or an option is wrong.
     """
 
     def __init__(
@@ -182,14 +184,18 @@ class AsmMirror(AdaptiveSecondary):
         layout: str = "",
         pitch_m: float = 1.0,
         stroke_m: float | None = None,
-        limits: MirrorLimits | None = None,
+        limits: MirrorLimits | Mapping[str, Any] | None = None,
         make_codec: Callable[[], m.Codec] = AsmCodec,
         emulator: Emulator | None = None,
         **options: Any,
     ) -> None:
         self._options = parse_options(AsmOptions, name, options, keywords_of(type(self)))
-        super().__init__(name, limits or CAUTIOUS_LIMITS, lift=self._options.lift)
-        self._expected = ExpectedMirror(require_serial("serial", serial), layout, pitch_m, stroke_m, limits)
+        given_limits = None if limits is None else parse_limits(name, limits)
+        super().__init__(name, given_limits or CAUTIOUS_LIMITS, lift=self._options.lift)
+        layout = require_geometry(name, layout, pitch_m, stroke_m)
+        self._expected = ExpectedMirror(
+            require_serial("serial", serial), layout, pitch_m, stroke_m, given_limits
+        )
         self._make_codec, self._emulator = make_codec, emulator
         self._is_on_twin = emulator is not None
         if emulator is None and self._options.host == EMULATOR:

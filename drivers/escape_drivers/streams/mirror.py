@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from escape_drivers.common.mirror import require_geometry
 from escape_drivers.common.options import keywords_of, layout_of, mirror_settings, section_options
 from escape_drivers.streams.source import (
     MILK,
@@ -21,7 +23,7 @@ from escape_drivers.streams.source import (
 from escape_hw.api.mirror import DeformableMirror, DMInfo
 from escape_hw.config import layouts
 from escape_hw.config.devices import mirror_info
-from escape_hw.config.options import parse_options
+from escape_hw.config.options import parse_limits, parse_options
 from escape_hw.config.section import Section
 from escape_hw.errors import DeviceError, NotOpen
 from escape_hw.io.interchange.stream import Stream
@@ -71,14 +73,14 @@ class StreamMirror(DeformableMirror):
     stroke_m
         Metres of surface at the actuator for a command of 1; NaN: not known.
     limits
-        Limits of every command.
+        Limits of every command; a table has those that differ from the cautious ones.
     **options
         Further fields of :class:`StreamMirrorOptions`.
 
     Raises
     ------
     ConfigError
-        No stream is named or an option is wrong.
+        No stream is named, or geometry, limits or an option is wrong.
     """
 
     SOURCE: ClassVar[StreamSource]
@@ -92,14 +94,16 @@ class StreamMirror(DeformableMirror):
         layout: str = "",
         pitch_m: float = 1.0,
         stroke_m: float = math.nan,
-        limits: MirrorLimits = CAUTIOUS_LIMITS,
+        limits: MirrorLimits | Mapping[str, Any] = CAUTIOUS_LIMITS,
         **options: Any,
     ) -> None:
-        super().__init__(name, limits)
+        super().__init__(name, parse_limits(name, limits))
         self._serial = stream_serial("stream", serial, stream)
         options = {**options, "stream": stream}
         self._options = parse_options(StreamMirrorOptions, name, options, keywords_of(type(self)))
-        self._layout, self._pitch_m, self._stroke_m = layout, pitch_m, stroke_m
+        self._layout = require_geometry(name, layout, pitch_m, stroke_m)
+        self._pitch_m, self._stroke_m = pitch_m, stroke_m
+        self._info = self._build_info(self._layout) if layout else None
         self._stream: Stream | None = None
         self._scaled_command, self._buffer = np.empty(0), np.empty(0)
         # Where the buffer holds the actuators; all of it, but for a map.
@@ -116,17 +120,19 @@ class StreamMirror(DeformableMirror):
     @property
     def info(self) -> DMInfo:
         """Identity and geometry; ``NotOpen`` before ``open`` if no layout was given."""
-        if not self._layout:
+        if self._info is None:
             raise NotOpen(self.name, "its number of actuators is known once it is open; call open() first")
+        return self._info
+
+    def _build_info(self, layout: str) -> DMInfo:
         model = f"{self.SOURCE.kind} {self._options.stream}"
         return mirror_info(
-            self._layout, self._pitch_m, self._stroke_m, model, self._serial,
-            simulated=self._options.simulated,
-        )  # fmt: skip
+            layout, self._pitch_m, self._stroke_m, model, self._serial, simulated=self._options.simulated
+        )
 
     def _open(self) -> None:
         stream = self._stream = open_stream(self.name, self.SOURCE, self._options.stream, write=True)
-        layout = self._layout = self._layout or layout_of(self.name, math.prod(stream.shape))
+        layout = self._layout or layout_of(self.name, math.prod(stream.shape))
         n_act = layouts.n_actuators(layout)
         grid = layouts.layout_map(layout) if layouts.is_on_grid(layout) else None
         if stream.shape == (n_act,):
@@ -137,10 +143,12 @@ class StreamMirror(DeformableMirror):
             wanted = f"({n_act},)" + ("" if grid is None else f" or {grid.shape}")
             raise DeviceError(
                 self.name,
-                f"stream '{stream.name}' has shape {stream.shape}; the layout {layout!r} needs {wanted}",
+                f"stream '{stream.name}' has shape {stream.shape}; "
+                f"the layout {layouts.shorten(layout)!r} needs {wanted}",
             )
         self._scaled_command, self._buffer = np.zeros(n_act), np.zeros(stream.shape)
         self._flat_buffer = self._buffer.reshape(-1)
+        self._info = self._build_info(layout)
 
     def _close(self) -> None:
         stream, self._stream = self._stream, None

@@ -64,10 +64,12 @@ def poke_shape(dm: DeformableMirror, actuator: int, amplitude: float) -> NDArray
     reached, report = dm.check(shape)
     if not report.is_unchanged:
         moved = reached[actuator] - dm.flat[actuator]
+        slew = f"max_slew = {dm.limits.max_slew}" if report.slewed else None
+        rules = ", ".join(filter(None, (dm.find_violation(shape), slew)))
         raise CommandRejected(
             dm.name,
             f"a poke of {amplitude:g} at actuator {actuator} is beyond its limits, which allow {moved:.4g} "
-            "with the other actuators flat; choose that or less",
+            f"with the other actuators flat ({rules}); choose that or less",
         )
     return shape
 
