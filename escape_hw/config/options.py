@@ -62,8 +62,8 @@ def parse_limits(device: str, limits: MirrorLimits | Mapping[str, Any]) -> Mirro
         return limits
     if not isinstance(limits, Mapping):
         raise ConfigError(
-            f"{device}.limits: {limits!r}  must be MirrorLimits or a table such as {{'max_stroke': 0.3}}, on the "
-            "command line --set limits.max_stroke=0.3"
+            f"{device}.limits: {limits!r}  must be MirrorLimits or a table such as {{'max_stroke': 0.3}}, on "
+            "the command line --set limits.max_stroke=0.3"
         )
     return parse_options(LimitsConfig, f"{device}.limits", {**asdict(CAUTIOUS_LIMITS), **limits}).to_limits()
 
