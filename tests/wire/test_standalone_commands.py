@@ -86,7 +86,7 @@ def test_a_mirror_of_an_unknown_arrangement_is_flattened_and_poked(escape, caplo
         (["poke", "0", "0.6"], 3, "a poke of 0.6 at actuator 0 is beyond its limits"),
         (["flat", "--mode", "sim"], 2, "not with --driver"),
         (["flat", "--set", "limits.max_stroke=2"], 2, "alpao.limits.max_stroke: 2  is out of range"),
-        (["flat", "--set", "limits=5"], 2, "alpao.limits: 5  must be a table"),
+        (["flat", "--set", "limits=5"], 2, "alpao.limits: 5  must be MirrorLimits or a table"),
         (["flat", "--set", "trigger_in=up"], 2, "alpao.trigger_in: 'up'  must be"),
         (["flat", "razor-shwfs"], 2, "unexpected extra argument"),
     ],

@@ -312,7 +312,7 @@ def test_limits_of_a_device_used_alone_may_be_a_table() -> None:
     for wrong, message in (
         ({"max_stork": 0.3}, "alpao.limits.max_stork: unknown option .did you mean 'max_stroke'"),
         ({"max_stroke": 3}, "alpao.limits.max_stroke: 3  is out of range"),
-        (5, "alpao.limits: 5  must be a table, .* --set limits.max_stroke=0.3"),
+        (5, "alpao.limits: 5  must be MirrorLimits or a table .* --set limits.max_stroke=0.3"),
     ):
         with pytest.raises(ConfigError, match=message):
             escape_hw.open_device("alpao", limits=wrong, **words)
