@@ -69,7 +69,7 @@ def parse_limits(device: str, limits: MirrorLimits | Mapping[str, Any]) -> Mirro
 
 
 def _plain(value: Any) -> Any:
-    """A value without numpy, as it is in a system file."""
+    """A value with NumPy arrays and scalars converted to plain Python ones."""
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
     if isinstance(value, Mapping):
