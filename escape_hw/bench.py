@@ -289,14 +289,14 @@ def build_standalone_device(driver: str, kind: type[D], /, **settings: Any) -> D
         The driver is unknown, not installed, of another class, works as a part of a system only, or does not
         take these settings.
     """
-    made_by = device_class(driver)
-    _require_arguments(driver, made_by, settings)
-    if issubclass(made_by, DeformableMirror) and settings.get("limits") is not None:
+    driver_class = device_class(driver)
+    _require_arguments(driver, driver_class, settings)
+    if issubclass(driver_class, DeformableMirror) and settings.get("limits") is not None:
         settings["limits"] = parse_limits(driver, settings["limits"])
-    turned_by = _orientation_keys(made_by)
-    given = {key: settings.pop(key) for key in turned_by.model_fields if key in settings}
-    orientation = parse_options(turned_by, driver, given)
-    device = call_factory(f"driver '{driver}'", kind, partial(made_by, **settings))
+    orientation_section = _orientation_section(driver_class)
+    given = {key: settings.pop(key) for key in orientation_section.model_fields if key in settings}
+    orientation = parse_options(orientation_section, driver, given)
+    device = call_factory(f"driver '{driver}'", kind, partial(driver_class, **settings))
     if isinstance(device, Camera) and isinstance(orientation, CameraOrientation):
         device.flip = orientation.flip
     elif isinstance(device, DeformableMirror) and isinstance(orientation, MirrorOrientation):
@@ -304,16 +304,16 @@ def build_standalone_device(driver: str, kind: type[D], /, **settings: Any) -> D
     return device
 
 
-def _orientation_keys(made_by: type[Device]) -> type[Section]:
-    """The keys that the base class of a device applies; none for a stage."""
-    if issubclass(made_by, Camera):
+def _orientation_section(driver_class: type[Device]) -> type[Section]:
+    """Section with the keys that the base class of a device applies; without keys for a stage."""
+    if issubclass(driver_class, Camera):
         return CameraOrientation
-    return MirrorOrientation if issubclass(made_by, DeformableMirror) else Section
+    return MirrorOrientation if issubclass(driver_class, DeformableMirror) else Section
 
 
-def _require_arguments(driver: str, made_by: type[Device], settings: Mapping[str, Any]) -> None:
+def _require_arguments(driver: str, driver_class: type[Device], settings: Mapping[str, Any]) -> None:
     """Refuse settings without a keyword that the driver needs."""
-    for name, parameter in inspect.signature(made_by).parameters.items():
+    for name, parameter in inspect.signature(driver_class).parameters.items():
         is_needed = parameter.default is parameter.empty and parameter.kind not in (
             parameter.VAR_POSITIONAL,
             parameter.VAR_KEYWORD,

@@ -141,6 +141,9 @@ Mode = Literal["sim", "hardware"]
 Polarity = Literal[-1, 1]
 Pixels = Annotated[int, Field(ge=0, le=16384)]
 Size = Annotated[int, Field(ge=1, le=16384)]
+#: Distance between actuators, and surface for a command of 1, metres.
+Pitch = Annotated[float, Field(gt=0, le=1)]
+Stroke = Annotated[float, Field(gt=0, le=1e-3)]
 #: Width and height of a sensor; x, y, width and height of a region.
 SensorSize = TomlArray[tuple[Size, Size]]
 RegionNumbers = TomlArray[tuple[Pixels, Pixels, Size, Size]]
@@ -265,7 +268,7 @@ class MirrorConfig(DeviceConfig):
         f"of the layout, or the layout's number of each: {ORDERS}",
     )
     polarity: Polarity = Field(1, description="-1: a positive command shortens the optical path")
-    pitch_m: float = Field(gt=0, le=1, description="distance between actuators on the mirror, metres")
+    pitch_m: Pitch = Field(description="distance between actuators on the mirror, metres")
     pitches_across_pupil: float = Field(
         gt=0, le=200, description="actuator pitches across the diameter of the pupil"
     )
@@ -309,7 +312,7 @@ class MirrorConfig(DeviceConfig):
         description="positions of the actuators: 'layout', or a table of columns and rows on the maps (text, "
         ".npy or FITS); empty: the file's own, or found on the maps",
     )
-    stroke_m: float = Field(gt=0, le=1e-3, description="metres of surface at the actuator for a command of 1")
+    stroke_m: Stroke = Field(description="metres of surface at the actuator for a command of 1")
     limits: LimitsConfig = Field(default_factory=LimitsConfig, description="limits of every command")
 
     @property

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 
-from pydantic import Field
-
+from escape_hw.config.devices import Pitch, Stroke
 from escape_hw.config.layouts import resolve_layout
 from escape_hw.config.options import parse_options
 from escape_hw.config.section import Section
@@ -15,8 +14,8 @@ from escape_hw.errors import ConfigError
 class _Lengths(Section):
     """The ranges are those of ``[devices.dm]``."""
 
-    pitch_m: float = Field(gt=0, le=1)
-    stroke_m: float | None = Field(None, gt=0, le=1e-3)
+    pitch_m: Pitch
+    stroke_m: Stroke | None = None
 
 
 def require_geometry(device: str, layout: str, pitch_m: float, stroke_m: float | None) -> str:
