@@ -15,7 +15,7 @@ class _Lengths(Section):
     """The ranges are those of ``[devices.dm]``."""
 
     pitch_m: Pitch
-    stroke_m: Stroke | None = None
+    stroke_m: Stroke = math.nan
 
 
 def require_geometry(device: str, layout: str, pitch_m: float, stroke_m: float | None) -> str:
@@ -42,8 +42,8 @@ def require_geometry(device: str, layout: str, pitch_m: float, stroke_m: float |
     ConfigError
         Layout, pitch or stroke is not possible.
     """
-    stroke_is_known = not (isinstance(stroke_m, float) and math.isnan(stroke_m))
-    lengths = {"pitch_m": pitch_m, "stroke_m": stroke_m if stroke_is_known else None}
+    stroke_is_known = stroke_m is not None and not (isinstance(stroke_m, float) and math.isnan(stroke_m))
+    lengths = {"pitch_m": pitch_m, **({"stroke_m": stroke_m} if stroke_is_known else {})}
     parse_options(_Lengths, device, lengths)
     try:
         return resolve_layout(layout) if layout else ""
