@@ -146,7 +146,10 @@ def test_positions_from_a_table_and_from_the_layout(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("cube", "settings", "message"),
     [
-        (truth()[::-1][:, :, :30], MapSettings(), "must be numbered as the layout"),
+        (truth()[np.random.default_rng(1).permutation(37)], MapSettings(), "must be numbered as the layout"),
+        (truth()[:, 33:44, 33:44], MapSettings(pixel_m=1 / FINE), "of 37 only, too few for their place"),
+        (np.where(truth() > 1e-6, truth(), 1e31), MapSettings(), "up to 1e.31, which are no heights"),
+        (1e-9 * truth(), MapSettings("nanometre", stroke_m=2e-6), "check devices.dm.influence_unit"),
         (truth(), MapSettings(pixel_m=0.2), "one pixel be 0.2 m"),
         (-truth(), MapSettings(), "reverse the sign of devices.dm.influence_poke"),
         (truth()[:5], MapSettings(), r"shape \(5, 77, 77\); influence functions of 37"),
@@ -169,3 +172,66 @@ def test_numpy_files_and_files_that_are_none(tmp_path: Path) -> None:
     for name in ("none.fits", "text.fits", "none.npy"):
         with pytest.raises(ConfigError, match="cannot be read"):
             read_cube(str(tmp_path / name), 37)
+
+
+@pytest.mark.parametrize("seen", [2.0, 2.3, 3.0])
+def test_a_part_of_the_mirror_is_placed_without_a_bias(seen: float, tmp_path: Path) -> None:
+    centre = np.array([0.3, -0.2])
+    cube = truth(X + centre[0], X + centre[1])
+    cube[:, np.hypot(*np.meshgrid(X, X)) > seen] = np.nan
+    maps = read_maps(written(tmp_path, cube), LAYOUT)
+    # Peaks that a gap cuts would move the outer actuators inwards, and the scale by per cent.
+    assert maps.pixel * FINE == pytest.approx(1.0, abs=2e-4)
+    middle = maps.to_mirror(np.array([[0.0, 0.0]]) + maps.centre_px)
+    assert middle == pytest.approx(np.zeros((1, 2)), abs=1e-9)
+    at = maps.to_pixels(LAYOUT[[18]])[0] - maps.to_pixels(np.zeros((1, 2)))[0]
+    assert at == pytest.approx(LAYOUT[18] * FINE, abs=0.01)
+
+
+def test_numbers_of_maps_that_show_other_actuators_are_named(tmp_path: Path) -> None:
+    cube = truth()
+    cube[[3, 20]] = cube[[20, 3]]
+    with pytest.raises(ConfigError, match=r"maps 3, 20 have their peak far from the actuator"):
+        read_maps(written(tmp_path, cube), LAYOUT)
+    # An actuator that does not move has no peak.
+    cube = truth()
+    cube[3] = 1e-3 * np.random.default_rng(2).standard_normal(cube[3].shape)
+    assert read_maps(written(tmp_path, cube), LAYOUT).positions[3] == pytest.approx(LAYOUT[3], abs=0.35)
+
+
+def test_positions_that_are_given_are_compared_with_the_maps(tmp_path: Path) -> None:
+    turned = truth()[:, ::-1]
+    header = {"CUNIT1": "mm", "CUNIT2": "mm", "CDELT1": 0.25, "CDELT2": 0.25, "CRPIX1": 39.0, "CRPIX2": 39.0}
+    with pytest.raises(ConfigError, match="have their peak far from the actuator"):
+        read_maps(written(tmp_path, turned, **header), LAYOUT, MapSettings(pitch_m=2e-3))
+    settings = MapSettings(positions="layout", pixel_m=1 / FINE)
+    with pytest.raises(ConfigError, match="have their peak far from the actuator"):
+        read_maps(written(tmp_path, turned), LAYOUT, settings)
+    header |= {"CRPIX1": 1000.0}
+    with pytest.raises(ConfigError, match="no actuator has its place on the maps"):
+        read_maps(written(tmp_path, truth(), **header), LAYOUT, MapSettings(pitch_m=2e-3))
+
+
+@pytest.mark.parametrize("seen", [2.6, 6.0])
+def test_maps_without_tip_and_tilt_are_refused(seen: float, tmp_path: Path) -> None:
+    x, y = np.meshgrid(X, X)
+    pupil = np.hypot(x, y) < seen
+    plane = np.stack([np.ones(pupil.sum()), x[pupil], y[pupil]], axis=1)
+    cube = truth() + np.random.default_rng(1).normal(0, 0.002, (len(LAYOUT), *pupil.shape))
+    cube[:, ~pupil] = np.nan
+    assert read_maps(written(tmp_path, cube), LAYOUT).pixel * FINE == pytest.approx(1.0, abs=2e-3)
+    for surface in cube:
+        surface[pupil] -= plane @ np.linalg.lstsq(plane, surface[pupil])[0]
+    with pytest.raises(ConfigError, match="the maps have no tilt"):
+        read_maps(written(tmp_path, cube), LAYOUT)
+
+
+def test_unknown_units_archives_and_complex_maps_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"BUNIT is 'waves'; set devices\.dm\.influence_unit"):
+        read_maps(written(tmp_path, truth(), BUNIT="waves"), LAYOUT)
+    np.savez(tmp_path / "maps.npz", truth())
+    with pytest.raises(ConfigError, match="it is an archive; save the maps alone"):
+        read_maps(str(tmp_path / "maps.npz"), LAYOUT)
+    np.save(tmp_path / "maps.npy", truth() * (1 + 1j))
+    with pytest.raises(ConfigError, match="its values are complex"):
+        read_maps(str(tmp_path / "maps.npy"), LAYOUT)

@@ -7,6 +7,7 @@ coordinates of its pixels. So the orientation and the scale of an interferometer
 from __future__ import annotations
 
 import io
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,7 +24,13 @@ from escape_hw.calibration.sprint.influence_shape import find_edge_actuators
 from escape_hw.errors import ConfigError, ProductError
 
 #: Metres in the units of heights and of pixels.
-_METRES = {"m": 1.0, "metre": 1.0, "mm": 1e-3, "um": 1e-6, "micrometre": 1e-6, "nm": 1e-9, "nanometre": 1e-9}
+_METRES = {
+    "m": 1.0, "metre": 1.0, "mm": 1e-3, "um": 1e-6, "micron": 1e-6, "micrometre": 1e-6, "nm": 1e-9,
+    "nanometre": 1e-9,
+}  # fmt: skip
+#: Largest value that can be a height: programs of interferometers mark pixels that are not measured by
+#: larger ones. Largest and smallest median peak in full strokes per unit command.
+_MAX_VALUE, _MAX_PEAK, _MIN_PEAK = 1e20, 100.0, 0.01
 #: Pixels per pitch above twice of which maps are binned.
 _PIXELS_PER_PITCH = 12
 #: Width in pitches beyond the outermost actuators up to which maps are continued.
@@ -33,6 +40,17 @@ _RIM = 2.0
 _FAR, _MIN_FAR_PIXELS = 3.0, 20
 #: Radius in pitches of the part of a map whose centroid is the position of its actuator.
 _CORE = 0.8
+#: Smallest measured share of that part, and largest distance of its measured pixels' mean from its centre as
+#: fraction of the radius: a peak at the rim of the maps would seem to be further inside.
+_MIN_MEASURED, _MAX_OFF_CENTRE = 0.5, 0.05
+#: Fraction of its radius beyond which that part is the surroundings of the peak.
+_SURROUNDINGS = 0.85
+#: A map whose largest height elsewhere is so many times that at its actuator, and this fraction of the
+#: median peak, is one of another actuator.
+_ELSEWHERE, _MIN_ELSEWHERE = 2.0, 0.3
+#: Radius in pitches of an actuator's own surface, and least tilt of the maps relative to that of the own
+#: surfaces: without it the tilt was removed.
+_OWN, _MIN_TILT = 1.5, 0.1
 #: Noise is filtered where there are so many pixels per pitch; its power is that beyond this fraction of the
 #: largest frequency along an axis.
 _MIN_FILTERED, _NOISE_BEYOND = 6, 0.9
@@ -40,8 +58,10 @@ _MIN_FILTERED, _NOISE_BEYOND = 6, 0.9
 #: that must be there. The others are where the layout has them: the peak of an actuator may not be in view.
 _MAX_DISTANCE, _MIN_SHARE = 0.35, 0.6
 _TRIMMING_ROUNDS = 6
-#: Smallest number of inner actuators that suffice for the place.
-_MIN_INNER = 9
+#: Smallest number of inner actuators that suffice for the place, and of any actuators.
+_MIN_INNER, _MIN_USED = 9, 4
+#: Times that centroids are taken about the place which the last ones gave.
+_CENTROID_ROUNDS = 2
 
 
 class MapSettings(NamedTuple):
@@ -135,6 +155,8 @@ def read_maps(file: str, layout: NDArray[np.float64], settings: MapSettings | No
         )
     maps = _place(file, content, layout, settings)
     maps = _bin(maps)
+    _require_own_peaks(file, maps)
+    _require_tilt(file, maps)
     surfaces = _without_offsets(maps)
     surfaces = surfaces * _scale(file, maps._replace(surfaces=surfaces), content.header, settings)
     maps = _extend(maps._replace(surfaces=surfaces), layout)
@@ -150,7 +172,9 @@ def _read(file: str, n_act: int) -> _File:
     positions = None
     try:
         if path.suffix == ".npy":
-            cube = np.asarray(read_array(path), dtype=float)
+            cube = _real(read_array(path))
+        elif path.suffix == ".npz":
+            raise ValueError("it is an archive; save the maps alone as .npy or FITS")
         else:
             cube, header, positions = _read_fits(read_bounded(path, MAX_ARRAY_BYTES))
     except (OSError, TypeError, ValueError, KeyError, ProductError) as error:
@@ -161,7 +185,18 @@ def _read(file: str, n_act: int) -> _File:
             f"have the shape ({n_act}, n_y, n_x)"
         )
     cube[np.isinf(cube)] = np.nan
+    if (largest := float(np.nanmax(np.abs(cube), initial=0.0))) > _MAX_VALUE:
+        raise ConfigError(
+            f"{path} has values up to {largest:.3g}, which are no heights; set the pixels that were not "
+            "measured to NaN"
+        )
     return _File(cube, header, positions)
+
+
+def _real(values: NDArray[Any]) -> NDArray[np.float64]:
+    if np.iscomplexobj(values):
+        raise ValueError("its values are complex; influence functions are real")
+    return np.array(values, dtype=float)
 
 
 def _read_fits(content: bytes) -> tuple[NDArray[np.float64], dict[str, Any], NDArray[np.float64] | None]:
@@ -176,7 +211,7 @@ def _read_fits(content: bytes) -> tuple[NDArray[np.float64], dict[str, Any], NDA
         if "POSITIONS" in hdus:
             table = hdus["POSITIONS"].data
             positions = np.stack([np.asarray(table[name], float) for name in ("X", "Y")], axis=1)
-        return np.array(image.data, dtype=float), dict(image.header), positions
+        return _real(image.data), dict(image.header), positions
 
 
 def _place(file: str, content: _File, layout: NDArray[np.float64], settings: MapSettings) -> InfluenceMaps:
@@ -188,7 +223,9 @@ def _place(file: str, content: _File, layout: NDArray[np.float64], settings: Map
         placed = from_header
         if content.positions_m is not None:
             return placed._replace(positions=content.positions_m / settings.pitch_m)
-        return placed._replace(positions=_positions_on(placed, layout))
+        centroids, _ = _centroids(placed, layout)
+        found = placed.to_mirror(centroids)
+        return placed._replace(positions=np.where(np.isfinite(found), found, layout))
     if settings.positions == "layout":
         if settings.pixel_m is None:
             raise ConfigError(
@@ -198,13 +235,15 @@ def _place(file: str, content: _File, layout: NDArray[np.float64], settings: Map
         return InfluenceMaps(content.cube, pixel, layout, middle, np.eye(2))
     if settings.positions:
         table = _read_table(settings.positions, len(layout))
-        return _fit_place(file, content.cube, table, layout, settings)
+        return _fit_place(file, content.cube, table, layout, settings, np.ones(len(layout), bool))
     magnitude = ndimage.uniform_filter(np.abs(np.nan_to_num(content.cube)), (0, 3, 3))
     peak = magnitude.reshape(len(layout), -1).argmax(axis=1)
     rows, columns = np.unravel_index(peak, content.cube.shape[1:])
-    rough = _fit_place(file, content.cube, np.stack([columns, rows], axis=1).astype(float), layout, settings)
-    centroids = rough.to_pixels(_positions_on(rough, layout))
-    return _fit_place(file, content.cube, centroids, layout, settings)
+    placed = _fit_place(file, content.cube, np.stack([columns, rows], axis=1).astype(float), layout, settings)
+    for _ in range(_CENTROID_ROUNDS):
+        centroids, in_view = _centroids(placed, layout)
+        placed = _fit_place(file, content.cube, centroids, layout, settings, in_view)
+    return placed
 
 
 def _read_table(file: str, n_act: int) -> NDArray[np.float64]:
@@ -248,16 +287,27 @@ def _header_sigma(header: dict[str, Any], pitch_m: float) -> tuple[float, float,
 
 def _fit_place(
     file: str, cube: NDArray[np.float64], at_px: NDArray[np.float64], layout: NDArray[np.float64],
-    settings: MapSettings,
+    settings: MapSettings, in_view: NDArray[np.bool_] | None = None,
 ) -> InfluenceMaps:  # fmt: skip
     """Shift, rotation, reflection and scale from the layout to positions on the maps (Procrustes).
 
-    Edge actuators are left out if the others suffice, because their peaks are displaced; actuators far from
-    their place are left out, in several rounds.
+    Positions are NaN where they are not known. Edge actuators are left out if the others suffice, because
+    their peaks are displaced; actuators far from their place are left out, in several rounds. With
+    ``in_view``, the actuators that the maps show, most of those must be at their place.
     """
-    inner = ~find_edge_actuators(layout)
+    known, checked = np.isfinite(at_px).all(axis=1), in_view is not None
+    in_view = np.ones(len(layout), bool) if in_view is None else in_view
+    if in_view.sum() < _MIN_USED:
+        raise ConfigError(
+            f"{file}: the maps show the whole peak of {int(in_view.sum())} actuators of {len(layout)} only, "
+            "too few for their place; give pixel coordinates in a FITS header, or "
+            "devices.dm.influence_positions"
+        )
+    if known.sum() < _MIN_USED:
+        raise _misplaced(file, known & in_view, in_view, settings)
+    inner = ~find_edge_actuators(layout) & known
     if inner.sum() < _MIN_INNER:
-        inner[:] = True
+        inner = known
     used, distance = inner, np.zeros(len(layout))
     for _ in range(_TRIMMING_ROUNDS):
         p, q = layout[used].mean(axis=0), at_px[used].mean(axis=0)
@@ -271,17 +321,24 @@ def _fit_place(
         distance = np.linalg.norm(away, axis=1) / max(scale, 1e-300)
         used = inner & (distance <= max(_MAX_DISTANCE, float(np.median(distance[inner]))))
     near = distance <= _MAX_DISTANCE
-    if near.mean() < _MIN_SHARE:
-        raise ConfigError(
-            f"{file}: only {int(near.sum())} of {len(layout)} maps have their actuator where "
-            "devices.dm.layout has it; the maps must be numbered as the layout"
-            + ("" if settings.pixel_m is None else f", and one pixel be {settings.pixel_m:g} m on the mirror")
-        )
+    if checked and near[in_view].mean() < _MIN_SHARE:
+        raise _misplaced(file, near & in_view, in_view, settings)
     placed = InfluenceMaps(
         cube, 1 / scale, layout, (float(centre[0]), float(centre[1])), orientation,
         _place_sigma(layout[used], distance[used], settings.pixel_m is None),
     )  # fmt: skip
     return placed._replace(positions=np.where(near[:, None], placed.to_mirror(at_px), layout))
+
+
+def _misplaced(
+    file: str, near: NDArray[np.bool_], in_view: NDArray[np.bool_], settings: MapSettings
+) -> ConfigError:
+    """The error of maps of which too few have their actuator at its place."""
+    return ConfigError(
+        f"{file}: only {int(near.sum())} of the {int(in_view.sum())} actuators in view are where "
+        "devices.dm.layout has them; the maps must be numbered as the layout"
+        + ("" if settings.pixel_m is None else f", and one pixel be {settings.pixel_m:g} m on the mirror")
+    )
 
 
 def _place_sigma(
@@ -295,22 +352,108 @@ def _place_sigma(
     return shift, shift, float(np.rad2deg(scatter / np.hypot(x, y))), scaling / float(x), scaling / float(y)
 
 
-def _positions_on(maps: InfluenceMaps, layout: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Centroids of the upper halves of the peaks, in pitches; those of the layout without a clear peak."""
-    found, radius = layout.copy(), _CORE / maps.pixel
-    for number, expected in enumerate(maps.to_pixels(layout)):
-        left, top = np.maximum(np.floor(expected - radius), 0).astype(int)
-        right, bottom = np.maximum(np.ceil(expected + radius) + 1, 0).astype(int)
-        height = np.abs(np.nan_to_num(maps.surfaces[number, top:bottom, left:right]))
-        rows, columns = np.indices(height.shape)
-        pixels = np.stack([columns.ravel() + left, rows.ravel() + top], axis=1)
-        weight = np.maximum(height - height.max(initial=0.0) / 2, 0.0).ravel()
-        weight[np.linalg.norm(pixels - expected, axis=1) > radius] = 0.0
-        if weight.sum() > 0:
-            centroid = maps.to_mirror((weight @ pixels / weight.sum())[None])[0]
-            if np.linalg.norm(centroid - layout[number]) < _MAX_DISTANCE:
-                found[number] = centroid
-    return found
+def _cores(
+    maps: InfluenceMaps, positions: NDArray[np.float64]
+) -> Iterator[tuple[NDArray[np.intp], NDArray[np.float64]]]:
+    """For every actuator, pixels ``(n, 2)`` within :data:`_CORE` of its position and their heights.
+
+    Pixels beyond the maps have the height NaN.
+    """
+    radius = _CORE / maps.pixel
+    size = np.array(maps.surfaces.shape[:0:-1])
+    for surface, at in zip(maps.surfaces, maps.to_pixels(positions), strict=True):
+        left, top = np.floor(at - radius).astype(int)
+        right, bottom = np.ceil(at + radius).astype(int) + 1
+        columns, rows = np.meshgrid(np.arange(left, right), np.arange(top, bottom))
+        pixels = np.stack([columns.ravel(), rows.ravel()], axis=1)
+        pixels = pixels[np.linalg.norm(pixels - at, axis=1) <= radius]
+        heights = np.full(len(pixels), np.nan)
+        on_maps = ((pixels >= 0) & (pixels < size)).all(axis=1)
+        heights[on_maps] = surface[pixels[on_maps, 1], pixels[on_maps, 0]]
+        yield pixels, heights
+
+
+def _centroids(
+    maps: InfluenceMaps, layout: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Centroids of the peaks as (column, row) ``(n, 2)``, and which peaks are in view.
+
+    They are those of the upper half, or of what is above the surroundings if that is less. NaN without a
+    clear peak near the place in the layout, or where it is not all in view.
+    """
+    found, in_view = np.full(layout.shape, np.nan), np.zeros(len(layout), bool)
+    expected = maps.to_pixels(layout)
+    for number, (pixels, heights) in enumerate(_cores(maps, layout)):
+        measured = np.isfinite(heights)
+        if measured.mean() < _MIN_MEASURED:
+            continue
+        off_centre = np.linalg.norm(pixels[measured].mean(axis=0) - pixels.mean(axis=0))
+        if off_centre * maps.pixel > _MAX_OFF_CENTRE * _CORE:
+            continue
+        in_view[number] = True
+        pixels, heights = pixels[measured], np.abs(heights[measured])
+        distance = np.linalg.norm(pixels - expected[number], axis=1) * maps.pixel
+        around = heights[distance > _SURROUNDINGS * _CORE].max(initial=0.0)
+        weight = np.maximum(heights - max(heights.max() / 2, around), 0.0)
+        if not weight.sum() > 0:
+            continue
+        centroid = weight @ pixels / weight.sum()
+        if np.linalg.norm(centroid - expected[number]) * maps.pixel < _MAX_DISTANCE:
+            found[number] = centroid
+    return found, in_view
+
+
+def _require_own_peaks(file: str, maps: InfluenceMaps) -> None:
+    """Refuse maps that show the peaks of other actuators than their numbers say."""
+    smooth = ndimage.uniform_filter(np.abs(np.nan_to_num(maps.surfaces)), (0, 3, 3))
+    at_place, elsewhere = np.zeros(len(smooth)), np.zeros(len(smooth))
+    in_view = np.zeros(len(smooth), bool)
+    smoothed = maps._replace(surfaces=np.where(np.isfinite(maps.surfaces), smooth, np.nan))
+    for number, (pixels, heights) in enumerate(_cores(smoothed, maps.positions)):
+        measured = np.isfinite(heights)
+        if measured.mean() < _MIN_MEASURED:
+            continue
+        in_view[number] = True
+        at_place[number] = heights[measured].max()
+        others = smooth[number].copy()
+        others[pixels[measured, 1], pixels[measured, 0]] = 0.0
+        elsewhere[number] = others.max()
+    if not in_view.any():
+        raise ConfigError(
+            f"{file}: no actuator has its place on the maps; check the pixel coordinates in the header "
+            "(CRPIX, CRVAL, CDELT, CUNIT) or devices.dm.influence_positions and influence_pixel_m"
+        )
+    least = _MIN_ELSEWHERE * float(np.median(np.maximum(at_place, elsewhere)[in_view]))
+    wrong = np.flatnonzero(in_view & (elsewhere > np.maximum(_ELSEWHERE * at_place, least)))
+    if wrong.size:
+        raise ConfigError(
+            f"{file}: maps {', '.join(map(str, wrong[:12]))}{', ...' if wrong.size > 12 else ''} have their "
+            "peak far from the actuator of that number; number and orient the maps as devices.dm.layout, and "
+            "set pixels that were not measured to NaN"
+        )
+
+
+def _require_tilt(file: str, maps: InfluenceMaps) -> None:
+    """Refuse maps whose tip and tilt were removed: no mirror has such functions.
+
+    An actuator beside the centre tilts the best-fitting plane as its own surface alone does, more or less.
+    """
+    rows, columns = np.indices(maps.surfaces.shape[1:])
+    at = maps.to_mirror(np.stack([columns.ravel(), rows.ravel()], axis=1))
+    plane = np.column_stack([np.ones(len(at)), at])
+    product = power = 0.0
+    for surface, position in zip(maps.surfaces.reshape(len(maps.surfaces), -1), maps.positions, strict=True):
+        measured = np.isfinite(surface)
+        near = np.linalg.norm(at - position, axis=1) < _OWN
+        own = np.where(near, surface, 0.0)
+        both = np.stack([surface[measured], own[measured]], axis=1)
+        tilt, own_tilt = np.linalg.lstsq(plane[measured], both)[0][1:].T
+        product, power = product + float(tilt @ own_tilt), power + float(own_tilt @ own_tilt)
+    if abs(product) < _MIN_TILT * power:
+        raise ConfigError(
+            f"{file}: the maps have no tilt, as if tip and tilt had been removed from each; put them back, "
+            "or measure the maps without removing them"
+        )
 
 
 def _bin(maps: InfluenceMaps) -> InfluenceMaps:
@@ -350,7 +493,13 @@ def _scale(file: str, maps: InfluenceMaps, header: dict[str, Any], settings: Map
     for surface, expected in zip(maps.surfaces, maps.to_pixels(maps.positions), strict=True):
         core = surface.ravel()[np.linalg.norm(pixels - expected, axis=1) < _CORE / maps.pixel / 2]
         core = core[np.isfinite(core)]
-        heights.append(core[np.abs(core).argmax()] if core.size else 0.0)
+        if core.size:
+            heights.append(core[np.abs(core).argmax()])
+    if unit not in (*_METRES, "stroke", "peak", ""):
+        raise ConfigError(
+            f"{file}: BUNIT is {unit!r}; set devices.dm.influence_unit to metre, micrometre, nanometre, "
+            "stroke or peak"
+        )
     peak = float(np.median(heights)) * np.sign(settings.poke)
     if not peak > 0:
         raise ConfigError(
@@ -363,7 +512,13 @@ def _scale(file: str, maps: InfluenceMaps, header: dict[str, Any], settings: Map
         factor = 1 / settings.poke
     else:
         return float(np.sign(settings.poke) / peak)
-    return factor / 2 if settings.wavefront else factor
+    factor = factor / 2 if settings.wavefront else factor
+    if not _MIN_PEAK < peak * abs(factor) < _MAX_PEAK:
+        raise ConfigError(
+            f"{file}: the median peak is {peak * abs(factor):.2g} full strokes for a command of full stroke; "
+            "check devices.dm.influence_unit, influence_poke and stroke_m"
+        )
+    return factor
 
 
 def _extend(maps: InfluenceMaps, layout: NDArray[np.float64]) -> InfluenceMaps:
