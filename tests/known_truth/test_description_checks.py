@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from small_matrices import CONFIG, GRID, MODEL, NOISE, TRUTH, measured
 from small_system import SMALL, configuration
 
+from escape_hw.calibration.sprint.description_checks import Clocking
 from escape_hw.calibration.sprint.fit import sprint
 from escape_hw.config.loader import load_system
 from escape_sim.models.factory import make_fast_model
@@ -99,3 +100,14 @@ def test_an_idle_mirror_is_no_wrong_layout(pattern: float) -> None:
     assert not estimate.converged
     assert "does the mirror move" in estimate.warnings[0]
     assert ("one pattern of slopes" in estimate.warnings[0]) == bool(pattern)
+
+
+@pytest.mark.parametrize("true_deg", [0.0, 0.2, 0.5, 2.0])
+def test_what_clocking_adds_to_the_variances_is_its_square_on_average(true_deg: float) -> None:
+    """Angles known to 0.3 degrees, of a camera that turns the rotation by a fifth of its clocking."""
+    rng, derivative = np.random.default_rng(8), np.array([0.0, 0.0, 0.2, 0.0, 0.0])
+    angles = true_deg + 0.3 * rng.standard_normal(4000)
+    added = np.mean([Clocking(a, 0.3, derivative * a).covariance[2, 2] for a in angles.tolist()])
+    # Never negative, so a little more where the angle is hardly known.
+    assert (0.2 * true_deg) ** 2 * 0.97 < added < (0.2 * true_deg) ** 2 * 1.03 + 0.6 * (0.2 * 0.3) ** 2
+    assert not Clocking(0.0, 0.3, np.zeros(5)).covariance.any()

@@ -22,9 +22,9 @@ _HARDLY_RESPONDS = -0.5
 #: Scalings in % of the same sign, and difference between the gains of x and y slopes, from which on they are
 #: named. They are correct results, so this limits what is displayed and nothing else.
 _NAMED_SCALING, _NAMED_STRETCH = 3.0, 0.02
-#: Clocking, in its standard errors, from which on its effect is added to the errors of the registration, and
-#: from which on it is named; gains of x and y slopes differ from as many standard errors on.
-_LIKELY, _SIGNIFICANT = 2.0, 3.0
+#: Clocking, in its standard errors, from which on it is named; gains of x and y slopes differ from as many
+#: standard errors on.
+_SIGNIFICANT = 3.0
 _MAX_NAMED = 8
 
 
@@ -103,9 +103,14 @@ class Clocking:
 
     @property
     def covariance(self) -> NDArray[np.float64]:
-        """What to add to that of the registration ``(5, 5)``: zero where the angle may be chance."""
-        is_likely = abs(self.angle_deg) > _LIKELY * self.sigma_deg
-        return np.outer(self.bias, self.bias) * is_likely
+        """What to add to that of the registration ``(5, 5)``.
+
+        The square of the bias, without what chance contributes to the square of the angle: its unbiased
+        estimate, where that is positive.
+        """
+        square = self.angle_deg**2
+        fraction = max(1 - self.sigma_deg**2 / square, 0.0) if square else 0.0
+        return np.outer(self.bias, self.bias) * fraction
 
     def describe(self) -> str | None:
         """A sentence for the operator; ``None`` where the angle may be chance."""
