@@ -295,16 +295,15 @@ def _fit_place(
     their peaks are displaced; actuators far from their place are left out, in several rounds. With
     ``in_view``, the actuators that the maps show, most of those must be at their place.
     """
-    known, checked = np.isfinite(at_px).all(axis=1), in_view is not None
-    in_view = np.ones(len(layout), bool) if in_view is None else in_view
-    if in_view.sum() < _MIN_USED:
+    known = np.isfinite(at_px).all(axis=1)
+    if in_view is not None and in_view.sum() < _MIN_USED:
         raise ConfigError(
             f"{file}: the maps show the whole peak of {int(in_view.sum())} actuators of {len(layout)} only, "
             "too few for their place; give pixel coordinates in a FITS header, or "
             "devices.dm.influence_positions"
         )
-    if known.sum() < _MIN_USED:
-        raise _misplaced(file, known & in_view, in_view, settings)
+    if in_view is not None and known.sum() < _MIN_USED:
+        raise _misplaced(file, known, in_view, settings)
     inner = ~find_edge_actuators(layout) & known
     if inner.sum() < _MIN_INNER:
         inner = known
@@ -321,7 +320,7 @@ def _fit_place(
         distance = np.linalg.norm(away, axis=1) / max(scale, 1e-300)
         used = inner & (distance <= max(_MAX_DISTANCE, float(np.median(distance[inner]))))
     near = distance <= _MAX_DISTANCE
-    if checked and near[in_view].mean() < _MIN_SHARE:
+    if in_view is not None and near[in_view].mean() < _MIN_SHARE:
         raise _misplaced(file, near & in_view, in_view, settings)
     placed = InfluenceMaps(
         cube, 1 / scale, layout, (float(centre[0]), float(centre[1])), orientation,
