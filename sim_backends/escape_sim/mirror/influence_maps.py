@@ -295,7 +295,7 @@ def _fit_place(
     their peaks are displaced; actuators far from their place are left out, in several rounds. With
     ``in_view``, the actuators that the maps show, most of those must be at their place.
     """
-    known = np.isfinite(at_px).all(axis=1)
+    known = np.asarray(np.isfinite(at_px).all(axis=1))
     if in_view is not None and in_view.sum() < _MIN_USED:
         raise ConfigError(
             f"{file}: the maps show the whole peak of {int(in_view.sum())} actuators of {len(layout)} only, "
