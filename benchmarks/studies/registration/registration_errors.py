@@ -105,6 +105,8 @@ def print_table(rows: list[Line]) -> None:
     statistics = {
         "rms": np.sqrt(np.mean(np.square(errors), axis=0)),
         "mean": errors.mean(axis=0),
+        "+-": errors.std(axis=0, ddof=1) / np.sqrt(len(errors)) if len(errors) > 1 else np.full(5, np.nan),
+        "largest": np.abs(errors).max(axis=0),
         "chi2": np.mean(np.square(errors / sigmas), axis=0),
     }
     if converged_rows[0].get("matrix_error") is not None:
