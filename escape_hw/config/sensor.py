@@ -48,8 +48,8 @@ class ShackHartmannSection(SensorSection):
     )
     motion_sigma: float = Field(
         0.25, gt=0, le=2,
-        description="SPRINT: relative uncertainty of the spots' motion; blur within the lenslets counts as "
-        "motion, too",
+        description="SPRINT: relative uncertainty of the spots' motion; choice, since blur within the "
+        "lenslets counts as motion, too",
     )  # fmt: skip
     valid: LayoutText | None = Field(
         None,
@@ -90,21 +90,24 @@ class PyramidSection(SensorSection):
     )
     turbulence_sigma: float = Field(
         0.4, gt=0, le=2,
-        description="SPRINT: relative uncertainty of the turbulence strength, found from the slopes' motion",
+        description="SPRINT: relative uncertainty of the turbulence strength, found from the slopes' motion, "
+        "which saturates: a twin of D/r0 = 22 was found as 14",
     )  # fmt: skip
     ellipticity_sigma: float = Field(
         0.05,
         gt=0,
         le=1,
-        description="SPRINT: relative ellipticity of the modulation, rms along each direction",
+        description="SPRINT: relative ellipticity of the modulation, rms along each direction; choice",
     )
     image_position_sigma_px: float = Field(
-        0.1, gt=0, le=10, description="SPRINT: uncertainty of the pupil images' relative positions, pixels"
-    )
+        0.1, gt=0, le=10,
+        description="SPRINT: uncertainty of the pupil images' relative positions, pixels; found on twins of "
+        "MAPS with a contaminated pupil",
+    )  # fmt: skip
     gain_trend: float = Field(
         0.3, gt=0, le=2,
         description="SPRINT: relative change of the slopes' gain towards the rim: under turbulence and pokes "
-        "the response there is known approximately",
+        "the response there is known approximately; found on twins of RAZOR: 0.2 to 0.3",
     )  # fmt: skip
 
     @model_validator(mode="after")

@@ -167,31 +167,35 @@ class LoopSection(Section):
 
 
 class PriorsSection(Section):
-    """Differences of real instruments from their model: rms among instruments of a kind.
+    """Differences of real instruments from their model (rms): starting values, most of them chosen.
 
     SPRINT fits them beside the registration and begins with these; all but that of the common width are then
     estimated from the data, between 0.05 and 3 times the value here.
     """
 
     actuator_gain: float = Field(
-        0.1, gt=0, le=2, description="gains of single actuators, relative; ALPAO DM97: 0.06 to 0.09 measured"
+        0.1, gt=0, le=2, description="gains of single actuators, relative; choice; ALPAO DM97: 0.09 to 0.10"
     )
     actuator_width: float = Field(
-        0.05, gt=0, le=1, description="widths of single influence functions, relative; ALPAO DM97: 0.02"
-    )
+        0.05, gt=0, le=1,
+        description="widths of single influence functions, relative; choice; ALPAO DM97: 0.03",
+    )  # fmt: skip
     actuator_position: float = Field(
-        5.0, gt=0, le=100, description="positions of single actuators along each axis, % of a sub-aperture"
-    )
+        5.0, gt=0, le=100,
+        description="positions of single actuators along each axis, % of a sub-aperture; choice",
+    )  # fmt: skip
     slope_gain: float = Field(
-        0.1, gt=0, le=2, description="gains of single slopes, relative: uneven light, spot size, pixels"
-    )
+        0.1, gt=0, le=2,
+        description="gains of single slopes, relative: uneven light, spot size, pixels; choice",
+    )  # fmt: skip
     sampling: float = Field(
         0.5, gt=0, le=50,
-        description="position of a lenslet within its column or row of pixels, % of a sub-aperture",
+        description="position of a lenslet within its column or row of pixels, % of a sub-aperture; choice",
     )  # fmt: skip
     width: float = Field(
-        0.2, gt=0, le=1, description="common width of the influence functions, relative to the nominal one"
-    )
+        0.2, gt=0, le=1,
+        description="common width of the influence functions, relative to the nominal one; choice",
+    )  # fmt: skip
 
 
 class CalibrationSection(Section):
