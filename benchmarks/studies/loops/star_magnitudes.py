@@ -5,7 +5,8 @@
 
 Both matrices come from the same frames. Each seed is a twin with a mirror and turbulence of its own, the
 same at all magnitudes, and each matrix is closed at its own best gain on equal turbulence
-(``loop_comparison.py``): ESCAPE's scaled by its optical gains, or as calibrated where these are refused. A
+(``loop_comparison.py``). The two are compared like with like: both scaled by their optical gains, or both as
+calibrated where the gains are refused. DO-CRIME's is also closed as calibrated at all magnitudes. A
 calibration that is refused counts as a Strehl ratio of zero, its message is kept. The mean of
 ``--sky-frames`` frames beside the star is subtracted from every frame; with 0, one level for all pixels.
 Prints the table and draws ``SYSTEM.png`` beside the raw tables ``SYSTEM-MAGNITUDE.jsonl``. A seed takes two
@@ -28,12 +29,13 @@ from loop_comparison import (
     measure_seed,
 )
 from matplotlib.axes import Axes
+from matplotlib.ticker import MultipleLocator
 
 from escape_benchmarks.realisation_tables import Line, each_realisation
 from escape_hw.errors import CalibrationError
 from escape_hw.io.run_folder import RunFolder
-from escape_hw.pipeline.statistics import mean_interval
-from escape_hw.report.figures.style import SERIES, legend, new_figure, style_axes
+from escape_hw.pipeline.statistics import MeanInterval, mean_interval
+from escape_hw.report.figures.style import INK, SERIES, legend, new_figure, style_axes
 from escape_hw.runtime.procedures.detector import DarkProcedure
 from escape_hw.runtime.session.record import BenchRecord
 from escape_hw.runtime.session.system import open_system
@@ -70,10 +72,22 @@ def measure_or_refuse(options: argparse.Namespace, number: int, until: float) ->
     return {"registrations": [], "strehl": {ESCAPE: 0.0, DOCRIME: 0.0}, "refused": refused}
 
 
+def has_gains(row: Line) -> bool:
+    """Whether the matrices of a seed were scaled by optical gains."""
+    return ESCAPE + GAINS in row["strehl"]
+
+
 def strehl(row: Line, name: str) -> float:
-    """Strehl ratio in %, with optical gains if they were found."""
+    """Strehl ratio in % of a matrix, scaled by its optical gains if these were found."""
     found: dict[str, float] = row["strehl"]
-    return found.get(name + GAINS, found.get(name, 0.0)) if name == ESCAPE else found[name]
+    return found[name + GAINS] if has_gains(row) else found[name]
+
+
+def difference(rows: list[Line]) -> MeanInterval | None:
+    """Strehl ratio with ESCAPE's matrix minus DO-CRIME's; ``None`` where no seed could be calibrated."""
+    if not any(row["registrations"] for row in rows):
+        return None
+    return mean_interval(np.array([strehl(row, ESCAPE) - strehl(row, DOCRIME) for row in rows]))
 
 
 def shift_errors(rows: list[Line]) -> tuple[list[float], list[float]]:
@@ -88,35 +102,76 @@ def _rms(values: list[float]) -> float:
 
 def print_table(tables: dict[float, list[Line]]) -> None:
     """Print a line per magnitude."""
-    print(f"| magnitude | {' | '.join(NAMES)} | difference | converged | shift, rms error | stated |")
-    print("|---" * (5 + len(NAMES)) + "|")
+    columns = (
+        "magnitude", "seeds with OG", *NAMES, "difference, points", f"{DOCRIME} without OG", "converged",
+        "shift, rms error", "stated",
+    )  # fmt: skip
+    print(f"| {' | '.join(columns)} |")
+    print("|---" * len(columns) + "|")
     for magnitude, rows in tables.items():
-        values = [np.array([strehl(row, name) for row in rows]) for name in NAMES]
+        means = [np.mean([strehl(row, name) for row in rows]) for name in NAMES]
+        without = np.mean([row["strehl"][DOCRIME] for row in rows])
         errors, sigmas = shift_errors(rows)
         print(
-            f"| {magnitude:g} | {' | '.join(f'{one.mean():.1f}' for one in values)} | "
-            f"{mean_interval(values[0] - values[-1])} | {len(errors) // 2} of {len(rows)} | "
-            f"{_rms(errors):.2g} | {_rms(sigmas):.2g} |"
+            f"| {magnitude:g} | {sum(map(has_gains, rows))} of {len(rows)} | "
+            f"{' | '.join(f'{one:.1f}' for one in means)} | {difference(rows) or 'none calibrated'} | "
+            f"{without:.1f} | {len(errors) // 2} of {len(rows)} | {_rms(errors):.2g} | {_rms(sigmas):.2g} |"
         )
 
 
 def _draw_strehl(axes: Axes, tables: dict[float, list[Line]]) -> None:
-    for name, colour in zip(NAMES, SERIES, strict=False):
-        for magnitude, rows in tables.items():
-            values = [strehl(row, name) for row in rows]
-            axes.plot([magnitude] * len(values), values, ".", color=colour, ms=4, alpha=0.5)
-        means = [np.mean([strehl(row, name) for row in rows]) for rows in tables.values()]
-        axes.plot(list(tables), means, "-", color=colour, label=name)
-    axes.set(xlabel="magnitude of the star", ylabel="Strehl ratio [%]", ylim=(0, None))
+    """Means over the seeds with their standard errors; solid with optical gains, dashed without."""
+    for number, name in enumerate((ESCAPE, DOCRIME)):
+        for suffix, line in ((GAINS, "o-"), ("", "s--")):
+            found = {
+                magnitude: np.array([row["strehl"][name + suffix] for row in rows])
+                for magnitude, rows in tables.items()
+                if all(name + suffix in row["strehl"] for row in rows)
+            }
+            if found:
+                means = [values.mean() for values in found.values()]
+                errors = [values.std(ddof=1) / np.sqrt(values.size) for values in found.values()]
+                label = name + suffix if suffix else f"{name}, as calibrated"
+                axes.errorbar(
+                    list(found), means, errors, fmt=line, color=SERIES[number], label=label, ms=3.5, lw=1.2,
+                    capsize=2, mfc=SERIES[number] if suffix else "white",
+                )  # fmt: skip
+    axes.set(ylabel="Strehl ratio [%]", ylim=(0, None))
+    legend(axes)
+
+
+def _draw_difference(axes: Axes, tables: dict[float, list[Line]]) -> None:
+    """Paired differences with their intervals; filled with optical gains, open as calibrated."""
+    for scaled, label in ((True, f"both{GAINS}"), (False, "both as calibrated")):
+        found = {
+            magnitude: one
+            for magnitude, rows in tables.items()
+            if all(map(has_gains, rows)) is scaled and (one := difference(rows))
+        }
+        if found:
+            means = [one.mean for one in found.values()]
+            halves = [one.high - one.mean for one in found.values()]
+            axes.errorbar(
+                list(found), means, halves, fmt="o" if scaled else "s", color=SERIES[3], label=label, ms=3.5,
+                capsize=2, mfc=SERIES[3] if scaled else "white",
+            )  # fmt: skip
+    axes.axhline(0, color=INK, lw=0.8)
+    axes.set(ylabel="ESCAPE minus DO-CRIME [points]")
     legend(axes)
 
 
 def _draw_shift(axes: Axes, tables: dict[float, list[Line]]) -> None:
-    found = [shift_errors(rows) for rows in tables.values()]
-    for k, (label, line) in enumerate((("rms error", "o-"), ("stated", "--"))):
-        axes.plot(list(tables), [_rms(pair[k]) for pair in found], line, color=SERIES[0], label=label)
-    axes.set(xlabel="magnitude of the star", ylabel="shift [% of a sub-aperture]", ylim=(0, None))
-    legend(axes)
+    """Error of the shift, with the standard error of an rms of that many values, and the stated one."""
+    found = {magnitude: shift_errors(rows) for magnitude, rows in tables.items()}
+    found = {magnitude: pair for magnitude, pair in found.items() if pair[0]}
+    rms = np.array([_rms(errors) for errors, _ in found.values()])
+    half = rms / np.sqrt([2 * len(errors) for errors, _ in found.values()])
+    axes.errorbar(list(found), rms, half, fmt="o-", color=SERIES[0], label="rms error", ms=3.5, capsize=2)
+    axes.plot(
+        list(found), [_rms(sigmas) for _, sigmas in found.values()], "--", color=SERIES[1], label="stated"
+    )
+    axes.set(ylabel="shift [% of a sub-aperture]", ylim=(0, None))
+    legend(axes, loc="upper left")
 
 
 def main() -> None:
@@ -141,11 +196,12 @@ def main() -> None:
             target, asked, options.seeds, lambda number: measure_or_refuse(options, number, until)
         )
     print_table(tables)
-    figure = new_figure(8.0, 3.2)
-    left, right = figure.subplots(1, 2)
-    _draw_strehl(style_axes(left), tables)
-    _draw_shift(style_axes(right), tables)
-    right.set_xlim(left.get_xlim())
+    figure = new_figure(11.0, 3.4)
+    panels = (_draw_strehl, _draw_difference, _draw_shift)
+    for draw, axes in zip(panels, figure.subplots(1, len(panels)), strict=True):
+        draw(style_axes(axes), tables)
+        axes.set(xlabel="magnitude of the star", xlim=(min(tables) - 0.4, max(tables) + 0.4))
+        axes.xaxis.set_major_locator(MultipleLocator(1))
     figure.savefig(folder / f"{options.system}.png", dpi=110, facecolor="white")
 
 
