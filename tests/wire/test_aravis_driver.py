@@ -185,6 +185,19 @@ def test_settings_go_to_the_increments_and_are_read_back(arv) -> None:
     assert not arv.violations
 
 
+def test_a_region_off_the_increments_is_reported(arv, caplog) -> None:
+    with make("aravis", "devices.science.region=[297,207,127,127]") as camera:
+        assert camera.settings.region == Region(296, 206, 126, 126)
+    assert (
+        "science: the region [297, 207, 127, 127] is not in the camera's steps (size 2 x 2, offsets 2 and 2"
+        "); it reads [296, 206, 126, 126]"
+    ) in caplog.text
+    caplog.clear()
+    with make("aravis"):
+        pass
+    assert "steps" not in caplog.text
+
+
 def test_what_is_wrong_at_opening(arv) -> None:
     with pytest.raises(DeviceError, match=r"no camera with serial number '17' \(found: SIMSCI\)"):
         make("aravis", 'devices.science.serial="17"').open()
