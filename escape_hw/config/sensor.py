@@ -72,6 +72,17 @@ class ShackHartmannSection(SensorSection):
         """Map ``(n_sub, n_sub)`` of the configured valid sub-apertures; ``None``: those that are lit."""
         return None if self.valid is None else layouts.layout_map(self.valid)
 
+    def least_region(self) -> tuple[int, int]:
+        """Width and height in pixels of the valid sub-apertures, or of those certainly within the pupil."""
+        valid = self.valid_map()
+        if valid is None:
+            # Sub-apertures at the rim may be dark, and beyond the region.
+            side = int((self.n_sub - 2) * self.pitch_px)
+            return side, side
+        columns, rows = (valid.any(axis=axis).nonzero()[0] for axis in (0, 1))
+        width, height = (int((at[-1] - at[0] + 1) * self.pitch_px) for at in (columns, rows))
+        return width, height
+
 
 class PyramidSection(SensorSection):
     """A four-sided pyramid sensor; a sub-aperture is one pixel of the pupil image."""
