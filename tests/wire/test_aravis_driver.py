@@ -152,6 +152,22 @@ def test_a_missing_pixel_format_is_refused_with_those_there_are(arv) -> None:
     assert not arv.violations
 
 
+def test_the_camera_of_revolt(arv, caplog) -> None:
+    arv.script("set profile c-blue-one")
+    settings = {
+        "library": arv.path, "pixel_format": "Mono10", "frame_rate_hz": 500.0, "region": (627, 377, 351, 351)
+    }  # fmt: skip
+    with AravisCamera("SIMCBLUE", exposure_s=1.99e-3, **settings) as camera:
+        assert camera.settings.region == Region(626, 376, 350, 350)
+        assert camera.info.full_scale == 1023
+    assert "reads [626, 376, 350, 350]" in caplog.text
+    with pytest.raises(SettingRejected, match=r"an exposure of 0\.002 s allow at most 498\.8"):
+        AravisCamera("SIMCBLUE", exposure_s=2e-3, **settings).open()
+    with pytest.raises(ConfigError, match=r"aravis\.pixel_format: 'Mono10p'  must be 'Mono16', "):
+        AravisCamera("SIMCBLUE", **settings | {"pixel_format": "Mono10p"})
+    assert not arv.violations
+
+
 def test_a_buffer_shorter_than_the_frame_is_never_read(arv) -> None:
     with make("aravis") as camera:
         held = ctypes.create_string_buffer(100)
