@@ -74,13 +74,15 @@ class ShackHartmannSection(SensorSection):
 
     def least_region(self) -> tuple[int, int]:
         """Width and height in pixels of the valid sub-apertures, or of those certainly within the pupil."""
+        import numpy as np
+
         valid = self.valid_map()
         if valid is None:
             # Sub-apertures at the rim may be dark, and beyond the region.
             side = int((self.n_sub - 2) * self.pitch_px)
             return side, side
-        columns, rows = (valid.any(axis=axis).nonzero()[0] for axis in (0, 1))
-        width, height = (int((at[-1] - at[0] + 1) * self.pitch_px) for at in (columns, rows))
+        used = (np.flatnonzero(valid.any(axis=axis)) for axis in (0, 1))
+        width, height = (int((np.ptp(at) + 1) * self.pitch_px) for at in used)
         return width, height
 
 
