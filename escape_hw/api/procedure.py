@@ -148,8 +148,8 @@ def run(
     try:
         with _set_on_ctrl_c(interrupted):
             return _advance_until_done(procedure, list(observers), abort or SignalSafeFlag(), interrupted)
-    except KeyboardInterrupt:
-        raise Aborted("interrupted by Ctrl-C") from None
+    except KeyboardInterrupt as interruption:
+        raise Aborted(f"interrupted by {str(interruption) or 'Ctrl-C'}") from None
     finally:
         _close(procedure)
 

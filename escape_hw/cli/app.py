@@ -11,6 +11,7 @@ import typer
 
 from escape_hw.cli.calibration import calibrate, reproduce, sweep
 from escape_hw.cli.calibration.procedure_command import procedure_command
+from escape_hw.cli.command import CommandGroup
 from escape_hw.cli.devices import asm, camera, discover, dm, emulate, modulator, with_stand_ins
 from escape_hw.cli.products import influence, interchange
 from escape_hw.cli.products import inspection as products
@@ -41,6 +42,7 @@ def build_app() -> typer.Typer:
     """The application with a command for every procedure."""
     app = typer.Typer(
         name="escape",
+        cls=CommandGroup,
         help="Calibrates adaptive-optics systems without a calibration source.",
         epilog="Exit codes: 0 done · 1 finished but failed its own criterion · 2 bad usage or configuration, "
         "nothing opened · 3 device or safety fault, mirror made safe · 130 aborted, partial data saved.",

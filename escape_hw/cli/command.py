@@ -6,12 +6,25 @@ import inspect
 from collections.abc import Callable, Iterable
 from typing import Annotated, Any, get_args
 
+from typer.core import TyperGroup
+
 from escape_hw.cli import options
 from escape_hw.cli.context import command_context
 
 Command = Callable[..., None]
 _SELECTION: dict[str, Any] = {"set": options.Set, "seed": options.Seed, "mode": options.Mode}
 _DEVICE: dict[str, Any] = {"driver": options.Driver, "serial": options.Serial}
+
+
+class CommandGroup(TyperGroup):
+    """Commands whose names are suggested for words in capitals, too."""
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """Find the command of the first word; raises a usage error if there is none."""
+        word, name = args[0], args[0].lower()
+        if word not in self.commands and name in self.commands:
+            ctx.fail(f"No such command '{word}'. Did you mean '{name}'?")
+        return super().resolve_command(ctx, args)
 
 
 def command(name: str, *, quiet: bool = False, without: tuple[str, ...] = ()) -> Callable[[Command], Command]:

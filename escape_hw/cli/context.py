@@ -55,8 +55,8 @@ class InterruptHandler:
 
     def __init__(self, notify: Callable[[str], None]) -> None:
         self.abort = SignalSafeFlag()
-        #: Whether a signal has raised ``KeyboardInterrupt``.
-        self.interrupted = False
+        #: Name of the signal that has raised ``KeyboardInterrupt``; empty: none.
+        self.interrupted_by = ""
         self._notify = notify
         self._in_procedure = False
         self._protected_activity = ""
@@ -116,8 +116,8 @@ class InterruptHandler:
             self.abort.set()
             self._notify("stopping: the mirror is flattened and the data are saved")
         else:
-            self.interrupted = True
-            raise KeyboardInterrupt
+            self.interrupted_by = "Ctrl-C" if number == signal.SIGINT else signal.Signals(number).name
+            raise KeyboardInterrupt(self.interrupted_by)
 
 
 _PIPE_WIDTH = 120
@@ -342,14 +342,14 @@ class CommandContext:
 
     def _classify_error(self, error: BaseException) -> tuple[int, str, str]:
         if isinstance(error, KeyboardInterrupt):
-            return ABORTED, "Aborted", "interrupted by Ctrl-C"
+            return ABORTED, "Aborted", f"interrupted by {str(error) or 'Ctrl-C'}"
         if isinstance(error, StorageError) and not self.devices_opened:
             return USAGE, type(error).__name__, str(error)
         if isinstance(error, EscapeError):
             return error.exit_code, type(error).__name__, str(error)
-        if self.interrupts.interrupted:
+        if signal_name := self.interrupts.interrupted_by:
             # A library that is being imported may turn the interruption into an error of its own.
-            return ABORTED, "Aborted", f"interrupted by Ctrl-C ({type(error).__name__})"
+            return ABORTED, "Aborted", f"interrupted by {signal_name} ({type(error).__name__})"
         if _is_file_error(error):
             message = f"{shorten_path(os.fsdecode(error.filename))}: {error.strerror or error}"
             return (FAILED if self.devices_opened else USAGE), "StorageError", message

@@ -117,9 +117,10 @@ def _leaves(section: type[BaseModel], prefix: str) -> Iterator[str]:
 
 
 def closest_match(word: str, choices: Iterable[str]) -> str | None:
-    """The choice most similar to a word, or ``None``."""
-    found = difflib.get_close_matches(word, list(choices), n=1, cutoff=0.6)
-    return found[0] if found else None
+    """The choice most similar to a word in upper or lower case, or ``None``."""
+    by_lower_case = {choice.lower(): choice for choice in choices}
+    found = difflib.get_close_matches(word.lower(), by_lower_case, n=1, cutoff=0.6)
+    return by_lower_case[found[0]] if found else None
 
 
 def closest_key(path: Sequence[str | int]) -> str | None:

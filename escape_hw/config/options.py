@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict
 from typing import Any, TypeVar
@@ -32,7 +33,7 @@ def parse_options(
     where
         Begins the names of settings in messages: a device, or a table of a system file.
     options
-        The settings by their names; numbers and arrays may be those of numpy.
+        The settings by their names; numbers and arrays may be those of numpy, and texts may be paths.
     also
         Names that are settings too, but not of this section; for suggestions.
 
@@ -69,9 +70,11 @@ def parse_limits(device: str, limits: MirrorLimits | Mapping[str, Any]) -> Mirro
 
 
 def _plain(value: Any) -> Any:
-    """A value with NumPy arrays and scalars converted to plain Python ones."""
+    """A value with NumPy arrays and scalars converted to plain Python ones, and paths to text."""
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
+    if isinstance(value, os.PathLike):
+        return os.fspath(value)
     if isinstance(value, Mapping):
         return {key: _plain(inner) for key, inner in value.items()}
     return [_plain(inner) for inner in value] if isinstance(value, list | tuple) else value

@@ -72,6 +72,19 @@ class ShackHartmannSection(SensorSection):
         """Map ``(n_sub, n_sub)`` of the configured valid sub-apertures; ``None``: those that are lit."""
         return None if self.valid is None else layouts.layout_map(self.valid)
 
+    def least_region(self) -> tuple[int, int]:
+        """Width and height in pixels of the valid sub-apertures, or of those certainly within the pupil."""
+        import numpy as np
+
+        valid = self.valid_map()
+        if valid is None:
+            # Sub-apertures at the rim may be dark, and beyond the region.
+            side = int((self.n_sub - 2) * self.pitch_px)
+            return side, side
+        used = (np.flatnonzero(valid.any(axis=axis)) for axis in (0, 1))
+        width, height = (int((np.ptp(at) + 1) * self.pitch_px) for at in used)
+        return width, height
+
 
 class PyramidSection(SensorSection):
     """A four-sided pyramid sensor; a sub-aperture is one pixel of the pupil image."""

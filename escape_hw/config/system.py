@@ -19,13 +19,11 @@ from escape_hw.config.choices import (
 )
 from escape_hw.config.devices import DeviceConfig, DevicesConfig, Mode, derive_tilt_scale
 from escape_hw.config.section import RuleViolation, Section, TomlArray, raise_violations
-from escape_hw.config.sensor import AnySensor, PyramidSection, SensorSection
+from escape_hw.config.sensor import AnySensor, PyramidSection, SensorSection, ShackHartmannSection
 from escape_hw.config.toml_text import dump_toml
 from escape_hw.config.twin import TwinConfig
 from escape_hw.errors import ConfigError
 
-#: Fewest pixels across a sub-aperture, those of a quad cell.
-_MIN_SPOT_PX = 2
 #: Largest relative difference of the twin's pupil images from their nominal diameter.
 _DIAMETER_RANGE = 0.1
 
@@ -345,11 +343,15 @@ class SystemConfig(Section):
         except ValueError as error:
             yield RuleViolation("twin.mirror.order", twin.mirror.order, str(error))
 
-    def _region_rules(self, n_sub: int) -> Iterator[RuleViolation]:
-        """The region of a Shack-Hartmann sensor has room for its spots."""
-        region, least = self.devices.wfs.region, _MIN_SPOT_PX * n_sub
-        if min(region[2:]) < least:
-            text = f"is too small for {n_sub} sub-apertures; needs at least {least} x {least} pixels"
+    def _region_rules(self, sensor: ShackHartmannSection) -> Iterator[RuleViolation]:
+        """The region of a Shack-Hartmann sensor has room for its sub-apertures."""
+        *_, width, height = region = self.devices.wfs.region
+        columns, rows = sensor.least_region()
+        if width < columns or height < rows:
+            text = (
+                f"is too small for {sensor.n_sub} sub-apertures of {sensor.pitch_px:g} pixels; "
+                f"needs at least {columns} x {rows} pixels"
+            )
             yield RuleViolation("devices.wfs.region", list(region), text)
 
     def _lenslet_rules(self) -> Iterator[RuleViolation]:
@@ -366,7 +368,7 @@ class SystemConfig(Section):
             text = f"is not used with sensor.kind = '{self.sensor.kind}'; remove it"
             for key, value in twin.pyramid.model_dump(exclude_defaults=True).items():
                 yield RuleViolation(f"twin.pyramid.{key}", value, text)
-            yield from self._region_rules(self.sensor.n_sub)
+            yield from self._region_rules(self.sensor)
             yield from self._lenslet_rules()
             return
         modulator, radius = self.devices.modulator, self.sensor.modulation

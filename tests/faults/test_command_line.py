@@ -145,7 +145,7 @@ def test_a_matrix_of_another_system_basis_or_mirror(run, system, good, tmp_path)
 
 
 def test_a_matrix_of_another_camera_region(run, system, im, tmp_path):
-    words = ("--set", "devices.wfs.region=[270,206,100,100]", "--no-strehl", "--out", tmp_path / "run")
+    words = ("--set", "devices.wfs.region=[220,156,187,187]", "--no-strehl", "--out", tmp_path / "run")
     code, document, _ = run("loop", system, "--im", im, *words)
     assert code == 2
     assert document["error"]["type"] == "IncompatibleProduct"

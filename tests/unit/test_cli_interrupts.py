@@ -87,8 +87,26 @@ def test_ctrl_c_in_a_reproduction_keeps_what_is_done(document, bench, tmp_path, 
     assert bench.benches[0].screen.state.inserted
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_an_interruption_that_a_library_turns_into_its_own_error(document, monkeypatch, number):
+@pytest.mark.parametrize(("number", "name"), [(signal.SIGINT, "Ctrl-C"), (signal.SIGTERM, "SIGTERM")])
+def test_the_message_names_the_signal(document, bench, tmp_path, monkeypatch, number, name):
+    def hang(place: str) -> None:
+        os.kill(os.getpid(), number)
+        os.kill(os.getpid(), number)
+
+    bench.hook = hang
+    _, found, _ = document("calibrate", "razor-shwfs", "--out", tmp_path / "run")
+    assert found["error"]["message"] == f"interrupted by {name}"
+
+    monkeypatch.setattr(
+        "escape_hw.cli.context.CommandContext.load_config", lambda *_: os.kill(os.getpid(), number)
+    )
+    _, found, err = document("config", "check", "razor-shwfs")
+    assert found["error"]["message"] == f"interrupted by {name}"
+    assert f"aborted: interrupted by {name}" in err
+
+
+@pytest.mark.parametrize(("number", "name"), [(signal.SIGINT, "Ctrl-C"), (signal.SIGTERM, "SIGTERM")])
+def test_an_interruption_that_a_library_turns_into_its_own_error(document, monkeypatch, number, name):
     def load(*_, **__):
         try:
             os.kill(os.getpid(), number)
@@ -99,4 +117,5 @@ def test_an_interruption_that_a_library_turns_into_its_own_error(document, monke
     code, found, err = document("config", "check", "razor-shwfs")
     assert code == 130
     assert found["error"]["type"] == "Aborted"
+    assert found["error"]["message"] == f"interrupted by {name} (ValueError)"
     assert "Traceback" not in err

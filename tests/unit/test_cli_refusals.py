@@ -53,6 +53,21 @@ def test_bad_usage_exits_2_with_one_line_and_nothing_opened(escape, document, be
     assert not bench.benches
 
 
+@pytest.mark.parametrize(
+    ("words", "meant"),
+    [
+        (("calibrate", "REVOLT-SHWFS"), "revolt-shwfs"),
+        (("reproduce", "REVOLT"), "revolt"),
+        (("reproduce", "revolt-shwf"), "revolt"),
+        (("CALIBRATE",), "calibrate"),
+    ],
+)
+def test_capitals_do_not_keep_a_name_from_being_suggested(document, words, meant):
+    code, found, _ = document(*words)
+    assert code == 2
+    assert f"did you mean '{meant}'" in found["error"]["message"].lower()
+
+
 def test_matrix_of_another_system_basis_or_mode_is_refused(escape, bench, tmp_path):
     def refused(name: str, matrix: object, origin: Provenance = fake.ORIGIN, *more: str) -> str:
         result = fake.calibration("escape")

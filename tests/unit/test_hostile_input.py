@@ -179,3 +179,27 @@ def test_a_product_with_wrong_contents_and_valid_checksums(
 def test_a_system_that_cannot_work_is_refused_before_opening(override: str, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         load_system("razor-shwfs", overrides=[override])
+
+
+@pytest.mark.parametrize(
+    ("system", "overrides", "least"),
+    [
+        ("revolt-shwfs", ("devices.wfs.region=[626,376,352,350]",), "352 x 352"),
+        ("revolt-shwfs", ("sensor.pitch_px=22.1",), "353 x 353"),
+        # Without a map of the valid sub-apertures those at the rim may be dark.
+        ("razor-shwfs", ("devices.wfs.region=[120,56,340,400]",), "341 x 341"),
+    ],
+)
+def test_a_region_without_room_for_the_subapertures_is_refused(
+    system: str, overrides: tuple[str, ...], least: str
+) -> None:
+    with pytest.raises(ConfigError, match=f"is too small for .* needs at least {least} pixels"):
+        load_system(system, overrides=overrides)
+
+
+def test_a_region_needs_no_room_for_subapertures_that_are_not_used(tmp_path: Path) -> None:
+    valid = np.zeros((16, 16), int)
+    valid[2:14, 1:15] = 1
+    np.savetxt(tmp_path / "valid.txt", valid, fmt="%d")
+    overrides = [f'sensor.valid="mask:{tmp_path}/valid.txt"', "devices.wfs.region=[600,300,308,264]"]
+    assert load_system("revolt-shwfs", overrides=overrides).devices.wfs.region[2:] == (308, 264)

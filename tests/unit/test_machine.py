@@ -160,6 +160,19 @@ def test_what_a_real_system_needs_and_lacks_is_an_error(bench: Path, monkeypatch
     assert doctor.exit_code(list(found.values())) == 2
 
 
+def test_doctor_finds_settings_that_a_driver_refuses(bench: Path) -> None:
+    words = ["devices.wfs.mode=hardware"]
+    assert "devices.wfs" not in levels(bench, load_system("revolt-shwfs", overrides=words))
+    for option, text in (
+        ("devices.wfs.options.pixel_format=Mono10p", "devices.wfs.options.pixel_format: 'Mono10p'  must be"),
+        ("devices.wfs.bit_depth=12", "bit_depth is 12, but pixel_format 'Mono10' has 10 bits"),
+        ("devices.wfs.options.shfit=1", "did you mean 'shift'"),
+    ):
+        found = levels(bench, load_system("revolt-shwfs", overrides=[*words, option]))["devices.wfs"]
+        assert found.level == "error"
+        assert text in found.text
+
+
 def test_doctor_finds_the_way_to_the_mirror(bench: Path, tmp_path: Path) -> None:
     words = ["devices.dm.mode=hardware"]
     found = levels(bench, load_system("maps-nir", overrides=words))

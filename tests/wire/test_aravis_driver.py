@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from driver_bench import fresh, make, stand_in
 
+from escape_drivers.aravis import AravisCamera
 from escape_drivers.aravis.library import ARAVIS, AravisLibrary, ReceivedBuffer
 from escape_hw.api.camera import Region
 from escape_hw.errors import ConfigError, DeviceError, DeviceLost, FrameTimeout, NotOpen, SettingRejected
@@ -35,6 +36,14 @@ OPENING = [
     "arv_camera_set_gain 0",
     "arv_camera_set_frame_rate 50",
 ]
+
+
+def pixels(bits: int, format_: str, shift: int = 0) -> tuple[str, ...]:
+    """Overrides for pixels of this kind."""
+    options = {"bit_depth": bits, "options.pixel_format": f'"{format_}"', "options.shift": shift}
+    return tuple(f"devices.science.{key}={value}" for key, value in options.items())
+
+
 READS = ("arv_camera_get_", "arv_camera_is_", "arv_stream_")
 
 
@@ -88,15 +97,75 @@ def test_lost_and_damaged_frames_are_counted(arv) -> None:
 
 
 @pytest.mark.parametrize(
-    ("format_", "shift", "top"), [("Mono16", 0, 4095), ("Mono16", 4, 255), ("Mono8", 0, 255)]
+    ("format_", "bits", "shift", "top"),
+    [("Mono16", 12, 0, 4095), ("Mono16", 12, 4, 255), ("Mono12", 12, 0, 4095), ("Mono8", 8, 0, 255)],
 )
-def test_pixel_formats(arv, format_, shift, top) -> None:
-    options = (f"devices.science.options.pixel_format={format_}", f"devices.science.options.shift={shift}")
-    with make("aravis", *options) as camera:
+def test_pixel_formats(arv, format_, bits, shift, top) -> None:
+    with make("aravis", *pixels(bits, format_, shift)) as camera:
         data = camera.next_frame(1.0).data
         assert data.dtype == np.uint16
         assert data.max() <= top
         assert data[3, 5] == (15 + 21) >> shift
+
+
+@pytest.mark.parametrize(
+    ("bits", "format_", "shift", "message"),
+    [
+        (12, "Mono10", 0, "bit_depth is 12, but pixel_format 'Mono10' has 10 bits; set bit_depth = 10"),
+        (10, "Mono12", 0, "bit_depth is 10, but pixel_format 'Mono12' has 12 bits; set bit_depth = 12"),
+        (10, "Mono8", 0, "bit_depth is 10, but pixel_format 'Mono8' has 8 bits"),
+        (8, "Mono10", 0, "bit_depth is 8, but pixel_format 'Mono10' has 10 bits"),
+        (16, "Mono16", 4, "bit_depth is 16, but shift = 4 leaves 12 of 16 bits; correct one of them"),
+        (10, "Mono16", 4, "bit_depth is 10, but shift = 4 leaves 12 of 16 bits"),
+        (8, "Mono8", 2, "bit_depth is 8, but shift = 2 leaves 6 of 8 bits"),
+    ],
+)
+def test_a_bit_depth_that_is_not_that_of_the_pixels(arv, bits, format_, shift, message) -> None:
+    with pytest.raises(ConfigError, match=f"science: {message}"):
+        make("aravis", *pixels(bits, format_, shift))
+
+
+@pytest.mark.parametrize(
+    ("bits", "format_", "shift"), [(10, "Mono16", 0), (12, "Mono16", 4), (12, "Mono12", 4), (10, "Mono10", 6)]
+)
+def test_words_that_contain_fewer_bits(arv, bits, format_, shift) -> None:
+    assert make("aravis", *pixels(bits, format_, shift)).info.bit_depth == bits
+
+
+@pytest.mark.parametrize(
+    ("options", "bits"),
+    [({}, 16), ({"shift": 4}, 12), ({"pixel_format": "Mono10"}, 10), ({"pixel_format": "Mono8"}, 8)],
+)
+def test_the_bit_depth_follows_from_the_format(options, bits) -> None:
+    assert AravisCamera("17", **options).info.bit_depth == bits
+
+
+def test_a_missing_pixel_format_is_refused_with_those_there_are(arv) -> None:
+    with pytest.raises(
+        DeviceError, match=r"has no pixel format 'Mono10' \(there are: Mono16, Mono12, Mono8\)"
+    ):
+        make("aravis", *pixels(10, "Mono10")).open()
+    arv.script("arv_camera_set_pixel_format_from_string 2 error 1")
+    with pytest.raises(DeviceError, match="from_string: scripted error"):
+        make("aravis").open()
+    assert arv.library.escape_stand_in_leaks() == 0
+    assert not arv.violations
+
+
+def test_the_camera_of_revolt(arv, caplog) -> None:
+    arv.script("set profile c-blue-one")
+    settings = {
+        "library": arv.path, "pixel_format": "Mono10", "frame_rate_hz": 500.0, "region": (627, 377, 351, 351)
+    }  # fmt: skip
+    with AravisCamera("SIMCBLUE", exposure_s=1.99e-3, **settings) as camera:
+        assert camera.settings.region == Region(626, 376, 350, 350)
+        assert camera.info.full_scale == 1023
+    assert "reads [626, 376, 350, 350]" in caplog.text
+    with pytest.raises(SettingRejected, match=r"an exposure of 0\.002 s allow at most 498\.8"):
+        AravisCamera("SIMCBLUE", exposure_s=2e-3, **settings).open()
+    with pytest.raises(ConfigError, match=r"aravis\.pixel_format: 'Mono10p'  must be 'Mono16', "):
+        AravisCamera("SIMCBLUE", **settings | {"pixel_format": "Mono10p"})
+    assert not arv.violations
 
 
 def test_a_buffer_shorter_than_the_frame_is_never_read(arv) -> None:
@@ -130,6 +199,19 @@ def test_settings_go_to_the_increments_and_are_read_back(arv) -> None:
             )
         assert camera.settings == before
     assert not arv.violations
+
+
+def test_a_region_off_the_increments_is_reported(arv, caplog) -> None:
+    with make("aravis", "devices.science.region=[297,207,127,127]") as camera:
+        assert camera.settings.region == Region(296, 206, 126, 126)
+    assert (
+        "science: the region [297, 207, 127, 127] is not in the camera's steps (size 2 x 2, offsets 2 and 2"
+        "); it reads [296, 206, 126, 126]"
+    ) in caplog.text
+    caplog.clear()
+    with make("aravis"):
+        pass
+    assert "steps" not in caplog.text
 
 
 def test_what_is_wrong_at_opening(arv) -> None:

@@ -31,12 +31,12 @@ pytestmark = pytest.mark.usefixtures("short_auto_zero")
 
 def mirror(**settings) -> AlpaoMirror:
     fresh("asdk", "set serial BAX118")
-    return AlpaoMirror(serial="bax118", library=str(stand_in("asdk").path), **settings)
+    return AlpaoMirror(serial="bax118", library=stand_in("asdk").path, **settings)
 
 
 def camera(**settings) -> XimeaCamera:
     fresh("m3api", "set serial 12345678")
-    return XimeaCamera(serial="12345678", library=str(stand_in("m3api").path), **settings)
+    return XimeaCamera(serial="12345678", library=stand_in("m3api").path, **settings)
 
 
 def stage(**settings) -> PiModulator:
@@ -224,7 +224,7 @@ def test_a_region_off_the_sensor_is_refused() -> None:
     assert not device.is_open
     assert not stand_in("m3api").violations
     fresh("aravis", "set serial 17")
-    device = AravisCamera(serial=17, region=(0, 500, 64, 64), library=str(stand_in("aravis").path))
+    device = AravisCamera(serial=17, region=(0, 500, 64, 64), library=stand_in("aravis").path)
     with pytest.raises(SettingRejected, match="does not lie on the sensor of 720 x 540 pixels"):
         device.open()
 

@@ -16,7 +16,7 @@ from escape_drivers.common.camera_limits import CameraLimits, ParameterRange
 from escape_drivers.common.options import camera_settings, section_options
 from escape_hw.api.camera import CameraSettings, Frame, Region
 from escape_hw.config.section import Section
-from escape_hw.errors import DeviceError, DeviceLost
+from escape_hw.errors import ConfigError, DeviceError, DeviceLost
 
 if TYPE_CHECKING:
     from escape_hw.config.devices import CameraConfig
@@ -47,9 +47,10 @@ class AravisOptions(Section):
     interface
         Interface to switch on first: ``"Fake"`` brings Aravis's own simulated camera.
     pixel_format
-        Format with 16 bits per pixel, or ``Mono8`` for 8; its name as GenICam has it.
+        Format with 16 bits per pixel, or ``Mono8`` for 8; its name as GenICam has it. ``Mono16`` may contain
+        counts of fewer bits.
     shift
-        Bits to shift counts right: for cameras that fill a 16-bit word from the top.
+        Bits to shift counts right: for cameras that fill a 16-bit word from the top, 16 less ``bit_depth``.
     buffers
         Frames that may wait to be read.
     newest
@@ -62,6 +63,26 @@ class AravisOptions(Section):
     shift: int = Field(0, ge=0, le=8)
     buffers: int = Field(8, ge=2, le=64)
     newest: bool = False
+
+    @property
+    def format_bits(self) -> int:
+        """Bits per pixel in the name of the format."""
+        return int(self.pixel_format.removeprefix("Mono"))
+
+    def require_bit_depth(self, device: str, bit_depth: int) -> None:
+        """Refuse a bit depth that is not that of the counts after the shift; raises ``ConfigError``."""
+        name, bits = self.pixel_format, self.format_bits
+        word = 8 if name == "Mono8" else 16
+        if bit_depth > bits or (bit_depth < bits and name != "Mono16"):
+            raise ConfigError(
+                f"{device}: bit_depth is {bit_depth}, but pixel_format '{name}' has {bits} bits; "
+                f"set bit_depth = {bits}, or choose another pixel_format"
+            )
+        if self.shift not in (0, word - bit_depth):
+            raise ConfigError(
+                f"{device}: bit_depth is {bit_depth}, but shift = {self.shift} leaves {word - self.shift} "
+                f"of {word} bits; correct one of them"
+            )
 
 
 class AravisCamera(BlockingCamera[AravisLibrary]):
@@ -81,14 +102,16 @@ class AravisCamera(BlockingCamera[AravisLibrary]):
     Raises
     ------
     ConfigError
-        The serial number is missing, or a setting is unknown or wrong.
+        The serial number is missing, a setting is unknown or wrong, or ``bit_depth`` does not belong to
+        ``pixel_format`` and ``shift``.
     """
 
     def __init__(self, serial: str | int, *, name: str = "aravis", **settings: Any) -> None:
         setup, options = split_settings(name, serial, settings, AravisOptions)
         if "bit_depth" not in settings:
-            bits = int(options.pixel_format.removeprefix("Mono"))
+            bits = 16 - options.shift if options.shift else options.format_bits
             setup = setup.model_copy(update={"bit_depth": bits})
+        options.require_bit_depth(name, setup.bit_depth)
         super().__init__(name, setup, "GenICam camera", _BLOCK_ID_RANGE)
         self._options = options
         self._incomplete = 0
@@ -108,7 +131,7 @@ class AravisCamera(BlockingCamera[AravisLibrary]):
         library = self._connection = AravisLibrary(self.name, self._options.library)
         library.open(self._setup.serial, self._options.interface)
         model = (library.call("camera_get_model_name") or b"GenICam camera").decode(errors="replace")
-        library.call("camera_set_pixel_format_from_string", self._options.pixel_format.encode())
+        library.set_pixel_format(self._options.pixel_format)
         for feature in _AUTO_FEATURES:
             if library.first_available([feature]):
                 library.call("camera_set_string", feature.encode(), b"Off")

@@ -46,6 +46,10 @@ _PROTOTYPES: Prototypes = {
     "arv_camera_set_region": (None, [c_void_p, c_int, c_int, c_int, c_int, _ERROR]),
     "arv_camera_get_region": (None, [c_void_p, _INT, _INT, _INT, _INT, _ERROR]),
     "arv_camera_set_pixel_format_from_string": (None, [c_void_p, c_char_p, _ERROR]),
+    "arv_camera_dup_available_pixel_formats_as_strings": (
+        POINTER(c_char_p),
+        [c_void_p, POINTER(c_uint), _ERROR],
+    ),
     "arv_camera_set_frame_rate": (None, [c_void_p, c_double, _ERROR]),
     "arv_camera_get_frame_rate": (c_double, [c_void_p, _ERROR]),
     "arv_camera_get_frame_rate_bounds": (None, [c_void_p, _REAL, _REAL, _ERROR]),
@@ -73,6 +77,7 @@ _PROTOTYPES: Prototypes = {
     "arv_stream_try_pop_buffer": (c_void_p, [c_void_p]),
     "arv_stream_timeout_pop_buffer": (c_void_p, [c_void_p, c_uint64]),
     "g_object_unref": (None, [c_void_p]),
+    "g_free": (None, [c_void_p]),
     "g_error_free": (None, [c_void_p]),
 }
 
@@ -152,6 +157,30 @@ class AravisLibrary(LoadedLibrary):
             if self.call("camera_is_feature_available", name.encode()):
                 return name
         return None
+
+    def set_pixel_format(self, name: str) -> None:
+        """Set the pixel format; an unavailable one is refused with those that the camera has."""
+        try:
+            self.call("camera_set_pixel_format_from_string", name.encode())
+        except DeviceError as error:
+            available = self._pixel_formats()
+            if name in available:
+                raise
+            raise DeviceError(
+                self.device,
+                f"has no pixel format '{name}' (there are: {', '.join(available)}); set the option "
+                "pixel_format, and bit_depth",
+            ) from error
+
+    def _pixel_formats(self) -> list[str]:
+        """Names of the pixel formats that the camera has."""
+        n = c_uint()
+        names = self.call("camera_dup_available_pixel_formats_as_strings", byref(n))
+        try:
+            return [(names[k] or b"").decode(errors="replace") for k in range(n.value)]
+        finally:
+            # The strings belong to the camera, the array does not.
+            self.c.g_free(names)
 
     def start_stream(self, n_buffers: int) -> None:
         """Make a stream with its buffers, and start acquisition."""

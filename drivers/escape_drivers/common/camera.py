@@ -8,6 +8,7 @@ import math
 import threading
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import astuple
 from typing import Any, Generic, Protocol, Self, TypeVar
 
 import numpy as np
@@ -253,6 +254,8 @@ class BlockingCamera(Camera, Generic[C]):
     def _check_setup(self) -> CameraSettings:
         """Nearest achievable settings to open with, on the sensor that was adopted.
 
+        Warns of a region that is not on the camera's increments.
+
         Raises
         ------
         SettingRejected
@@ -260,7 +263,18 @@ class BlockingCamera(Camera, Generic[C]):
         """
         want = self._setup.settings(self._sensor_px)
         self._require_valid(want)
-        return self._check(want)
+        answer = self._check(want)
+        if answer.region != want.region:
+            limits = self._require_limits()
+            log.warning(
+                "%s: the region %s is not in the camera's steps (size %d x %d, offsets %d and %d); "
+                "it reads %s",
+                self.name,
+                list(astuple(want.region)),
+                *(limits.width.step, limits.height.step, limits.x_step, limits.y_step),
+                list(astuple(answer.region)),
+            )
+        return answer
 
     def _check(self, want: CameraSettings) -> CameraSettings:
         answer = self._require_limits().nearest_valid(self.name, want, self._max_exposure_s(want))

@@ -9,11 +9,15 @@ from typing import Annotated, Any
 import typer
 
 from escape_hw.cli import options
-from escape_hw.cli.command import command
+from escape_hw.cli.command import CommandGroup, command
 from escape_hw.cli.context import CommandContext
 from escape_hw.cli.options import SystemSelection
 
-app = typer.Typer(help="The paper's tables and figures in simulation, with a report.", no_args_is_help=True)
+app = typer.Typer(
+    help="The paper's tables and figures in simulation, with a report.",
+    no_args_is_help=True,
+    cls=CommandGroup,
+)
 _System = Annotated[SystemSelection, typer.Option("--system", help="System to run on.")]
 _SHWFS, _PYWFS, _MAPS, _REVOLT = map(
     SystemSelection, ("razor-shwfs", "razor-pywfs", "maps-nir", "revolt-shwfs")

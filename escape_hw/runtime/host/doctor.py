@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from escape_hw.errors import ConfigError
+from escape_hw.errors import ConfigError, EscapeError
 from escape_hw.runtime.host import udev
 from escape_hw.runtime.host.computer import Host, route_to, user_name
 
@@ -55,7 +55,7 @@ class Finding:
 def check_computer(
     config: SystemConfig | None, host: Host | None = None, data: Path | None = None
 ) -> list[Finding]:
-    """Check packages, vendor libraries, permissions, USB, serial lines, processor, network and disk.
+    """Check packages, settings, vendor libraries, permissions, USB, serial lines, processor, network, disk.
 
     With a configuration, missing needs of the system's real devices are errors. Without one, every driver is
     checked, and missing libraries are only reported. ``data`` is the folder for products, by default the
@@ -66,6 +66,7 @@ def check_computer(
     return [
         *_check_packages(),
         *_check_window(),
+        *_check_settings(config),
         *_check_libraries(hardware),
         *_check_permissions(host, hardware),
         *_check_usb(host, hardware),
@@ -90,11 +91,21 @@ def _hardware_sections(config: SystemConfig | None) -> dict[str, DeviceConfig] |
     """Sections of the system's real devices by driver; ``None`` without a system."""
     if config is None:
         return None
+    return {section.driver: section for _, section in _real_devices(config)}
+
+
+def _real_devices(config: SystemConfig) -> Iterator[tuple[str, DeviceConfig]]:
+    """Keys and sections of the system's real devices."""
     from escape_hw.bench import resolve_mode
     from escape_hw.config.devices import DeviceConfig
 
-    sections = [section for _, section in config.devices if isinstance(section, DeviceConfig)]
-    return {s.driver: s for s in sections if s.driver and resolve_mode(s, config) == "hardware"}
+    for name, section in config.devices:
+        if (
+            isinstance(section, DeviceConfig)
+            and section.driver
+            and resolve_mode(section, config) == "hardware"
+        ):
+            yield name, section
 
 
 def _data_folder() -> Path:
@@ -145,6 +156,22 @@ def _check_window() -> Iterator[Finding]:
         "window", not missing, f"Qt misses {', '.join(missing)}" if missing else "Qt has its libraries",
         f"apt install {' '.join(missing)}",
     )  # fmt: skip
+
+
+def _check_settings(config: SystemConfig | None) -> Iterator[Finding]:
+    """Whether the drivers accept the sections of the system's real devices; opens none."""
+    if config is None:
+        return
+    from escape_hw.api.device import Device
+    from escape_hw.config.registry import DeviceContext, call_factory, device_factory
+
+    shared: dict[str, object] = {}
+    for name, section in _real_devices(config):
+        try:
+            factory = device_factory(section.driver, hardware=True)
+            call_factory(f"devices.{name}", Device, factory, section, DeviceContext(name, config, shared))  # type: ignore[type-abstract]
+        except EscapeError as error:
+            yield Finding(f"devices.{name}", "error", str(error), "correct this section of the system file")
 
 
 # --------------------------------------------------------------------- vendor libraries

@@ -82,12 +82,13 @@ class _Simulated(Generic[Info]):
 
 
 class SimMirror(_Simulated[DMInfo], DeformableMirror):
-    """Simulated ALPAO DM97: latency, settling, creep, gain scatter, saturation."""
+    """Simulated deformable mirror: latency, settling, creep, gain scatter, saturation."""
 
     def __init__(self, name: str, bench: SimBench) -> None:
         super().__init__(name, bench.config.devices.dm.limits.to_limits())
         self._bench = bench
-        self._info = bench.config.devices.dm.info("simulated ALPAO DM97-15", simulated=True)
+        dm = bench.config.devices.dm
+        self._info = dm.info(f"simulated mirror of {dm.n_act} actuators", simulated=True)
 
     def _open(self) -> None:
         self._bench.set_positions(np.zeros(self._info.n_act))
@@ -156,7 +157,7 @@ class _SimCamera(_Simulated[CameraInfo], Camera):
 
 
 class SimWavefrontSensorCamera(_SimCamera):
-    """Simulated XIMEA camera behind lenslets or pyramid: rate limits, noise, lost frames.
+    """Simulated camera behind lenslets or pyramid: rate limits, noise, lost frames.
 
     While a modulator runs, it triggers the camera once per cycle or once per several cycles, whichever
     is nearest to the configured rate; an exposure lasts whole cycles.
@@ -164,7 +165,7 @@ class SimWavefrontSensorCamera(_SimCamera):
 
     def __init__(self, name: str, bench: SimBench) -> None:
         section = bench.config.devices.wfs
-        super().__init__(name, bench, section, "simulated XIMEA MQ013MG-ON")
+        super().__init__(name, bench, section, "simulated wavefront-sensor camera")
         self._nominal = Region(*section.region)
         self._period, self._first = 0.0, 0
 
@@ -233,7 +234,7 @@ class SimScienceCamera(_SimCamera):
     """Simulated science camera, which integrates the focal plane while the loop runs."""
 
     def __init__(self, name: str, bench: SimBench) -> None:
-        super().__init__(name, bench, bench.science_section, "simulated FLIR Grasshopper3")
+        super().__init__(name, bench, bench.science_section, "simulated science camera")
         self._plane: FocalPlane | None = None
         self._detector: Detector | None = None
 

@@ -53,7 +53,7 @@ static const struct profile {
 };
 static const struct profile *profile;
 static char serial[64], rate_switch[64];
-static int sensor_w, sensor_h, increment, n_open_errors;
+static int sensor_w, sensor_h, increment, n_open_errors, n_open_lists;
 static long first_frame;
 static struct {
     int64_t index, exposed_ns;
@@ -82,7 +82,7 @@ static void si_reset_device(void) {
     snprintf(rate_switch, sizeof rate_switch, "AcquisitionFrameRateEnable");
     increment = 2;
     first_frame = 65401; /* a run of a few seconds crosses the end of the 16-bit counter */
-    n_open_errors = 0;
+    n_open_errors = n_open_lists = 0;
 }
 
 static int si_set_property(const char *key, const char *value) {
@@ -99,8 +99,8 @@ static int si_set_property(const char *key, const char *value) {
 
 EXPORT const char *escape_stand_in(void) { return "libaravis stand-in"; }
 
-/* Objects and errors that were not released. */
-EXPORT int escape_stand_in_leaks(void) { return camera.alive + stream.alive + n_open_errors; }
+/* Objects, errors and lists that were not released. */
+EXPORT int escape_stand_in_leaks(void) { return camera.alive + stream.alive + n_open_errors + n_open_lists; }
 
 static void set_error(GError **error, const char *message) {
     if (error == NULL) return;
@@ -277,6 +277,24 @@ EXPORT void arv_camera_set_pixel_format_from_string(void *handle, const char *fo
     if (strncmp(format, "Mono", 4) || strstr(profile->formats, format) == NULL)
         return set_error(error, "[PixelFormat] entry not found");
     camera.bytes = strcmp(format, "Mono8") ? 2 : 1;
+}
+
+/* The caller frees the list, not the names in it. */
+EXPORT const char **arv_camera_dup_available_pixel_formats_as_strings(void *handle, unsigned *n, GError **error) {
+    static char names[64];
+    BEGIN("arv_camera_dup_available_pixel_formats_as_strings", NULL, "%s", "");
+    snprintf(names, sizeof names, "%s", profile->formats);
+    const char **list = malloc(sizeof names * sizeof *list);
+    *n = 0;
+    for (char *name = strtok(names, " "); name; name = strtok(NULL, " ")) list[(*n)++] = name;
+    n_open_lists++;
+    return list;
+}
+
+EXPORT void g_free(void *list) {
+    if (list == NULL) return;
+    n_open_lists--;
+    free(list);
 }
 
 EXPORT int arv_camera_is_feature_available(void *handle, const char *name, GError **error) {

@@ -48,7 +48,7 @@ static const char *const si_renamed[][2] = {
 };
 
 struct si_rule {
-    char function[32];
+    char function[64];
     long first, last;
     enum si_action action;
     long argument;
@@ -146,8 +146,8 @@ static void si_replace_old_word(char *word, size_t size) {
 }
 
 static int si_parse_rule(const char *line) {
-    char function[32], when[32], action[32], argument[64] = "";
-    int n = sscanf(line, " %31s %31s %31s %63s", function, when, action, argument);
+    char function[64], when[32], action[32], argument[64] = "";
+    int n = sscanf(line, " %63s %31s %31s %63s", function, when, action, argument);
     if (n <= 0 || function[0] == '#') return 1;
     if (strcmp(function, "set") == 0) {
         si_replace_old_word(when, sizeof when);
