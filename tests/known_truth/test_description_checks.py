@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from small_matrices import CONFIG, GRID, MODEL, NOISE, TRUTH, measured
 from small_system import SMALL, configuration
 
+from escape_hw.calibration.sprint.description_checks import Clocking
 from escape_hw.calibration.sprint.fit import sprint
 from escape_hw.config.loader import load_system
 from escape_sim.models.factory import make_fast_model
@@ -99,3 +100,23 @@ def test_an_idle_mirror_is_no_wrong_layout(pattern: float) -> None:
     assert not estimate.converged
     assert "does the mirror move" in estimate.warnings[0]
     assert ("one pattern of slopes" in estimate.warnings[0]) == bool(pattern)
+
+
+def test_y_slopes_before_x_slopes_are_named() -> None:
+    matrix = measured(0)
+    x, y = np.split(matrix.data, 2)
+    estimate = sprint(replace(matrix, data=np.concatenate([y, x])), MODEL)
+    assert not estimate.converged
+    assert "order of the slopes (matrix.slopes" in estimate.warnings[0], estimate.warnings
+
+
+def test_no_clocking_is_named_where_the_fit_did_not_converge() -> None:
+    matrix = measured(0)
+    estimate = sprint(replace(matrix, data=-clocked(matrix.data).astype(np.float32)), MODEL)
+    assert "the gain is negative" in estimate.warnings[0]
+    assert not any("clocked" in note for note in estimate.notes)
+
+
+@pytest.mark.parametrize(("angle", "named"), [(0.004, False), (0.006, True), (-0.004, False)])
+def test_an_angle_that_is_printed_as_zero_is_not_named(angle: float, named: bool) -> None:
+    assert bool(Clocking(angle, 1e-4, np.zeros(5)).describe()) is named
