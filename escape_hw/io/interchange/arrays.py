@@ -380,13 +380,15 @@ def actuator_order(table: ActuatorTable, target: ArrayTarget, folder: Path = Pat
         The order is no permutation of the system's actuators, or flips are asked for without a grid.
     """
     turned = table.transpose or table.flip_x or table.flip_y
+    order: NDArray[np.intp] | NDArray[np.float64]
     if not table.order:
         order = np.arange(target.n_act) if not turned else _order_on_grid(table, target)
     elif turned:
         raise ConfigError("actuators.order gives the numbering; remove transpose, flip_x and flip_y")
+    elif isinstance(table.order, str):
+        order = _read_numbers(folder / table.order).ravel()
     else:
-        named = isinstance(table.order, str)
-        order = (_read_numbers(folder / str(table.order)) if named else np.array(table.order)).ravel()
+        order = np.array(table.order, dtype=np.intp)
     if not np.array_equal(np.sort(order), np.arange(target.n_act)):
         raise IncompatibleProduct(
             f"actuators.order has {order.size} numbers; the {target.n_act} actuators of system "
