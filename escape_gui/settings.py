@@ -9,8 +9,8 @@ from typing import Literal
 import platformdirs
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from escape_hw.config.key_tree import closest_match
 from escape_hw.io.storage import write_atomic
+from escape_hw.suggestions import closest_match
 
 #: Workspace that the window shows when it is opened for the first time.
 FIRST_WORKSPACE = "align"

@@ -68,14 +68,28 @@ def read_array(path: Path, name: str = "") -> NDArray[Any]:
         Not there, damaged, or without such an array.
     """
     try:
-        content = read_bounded(path, MAX_ARRAY_BYTES)
-        if content.startswith(b"\x1f\x8b"):
-            content = _unpack(content)
-        return decode_array(content, name)
+        return decode_array(_read_content(path), name)
     except Exception as error:
         # NumPy, astropy and zlib raise errors of many kinds for damaged files.
         reason = error.strerror if isinstance(error, OSError) and error.strerror else error
         raise ProductError(f"{path}: cannot be read ({reason})") from error
+
+
+def array_names(path: Path) -> list[str]:
+    """Names of the arrays in an ``.npz`` archive or of the images in a FITS file; empty for other files.
+
+    Raises
+    ------
+    OSError, ValueError
+        As :func:`load_arrays`.
+    """
+    content = _read_content(path)
+    if content.startswith(b"SIMPLE"):
+        from astropy.io import fits
+
+        with fits.open(io.BytesIO(content), memmap=False) as hdus:
+            return [hdu.name for hdu in hdus if hdu.is_image and hdu.data is not None]
+    return list(decode_arrays(content)) if content.startswith(b"PK") else []
 
 
 def decode_array(content: bytes, name: str = "", n_axes: int | None = None) -> NDArray[Any]:
@@ -105,6 +119,12 @@ def decode_array(content: bytes, name: str = "", n_axes: int | None = None) -> N
     if name and name not in loaded:
         raise ValueError(f"has no array {name!r}, only {', '.join(loaded)}")
     return loaded[name] if name else next(iter(loaded.values()))
+
+
+def _read_content(path: Path) -> bytes:
+    """The content of a file, without compression by gzip."""
+    content = read_bounded(path, MAX_ARRAY_BYTES)
+    return _unpack(content) if content.startswith(b"\x1f\x8b") else content
 
 
 def _unpack(content: bytes) -> bytes:

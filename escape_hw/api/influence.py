@@ -11,6 +11,8 @@ from escape_hw.api.representation import short_repr
 
 #: FITS cards of the errors of the place: shifts in metres, rotation in degrees, scalings in %.
 PLACE_CARDS = ("ERR_SHX", "ERR_SHY", "ERR_ROT", "ERR_RAD", "ERR_TAN")
+#: Card of the primary header: whether the model of the fit fits. Absent where it is not judged.
+MODEL_FITS_CARD = "MODELFIT"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,6 +63,8 @@ class InfluenceEstimate:
     place_sigma
         Standard errors of the place on the mirror ``(5,)``: shifts in metres on the pupil, rotation in
         degrees, scalings in %. They are those of the registration, from which the shape is not independent.
+    model_fits
+        Whether the model of the fit fits to within the noise; ``None`` where it is not judged.
     """
 
     surfaces: NDArray[np.float64]
@@ -75,4 +79,5 @@ class InfluenceEstimate:
     edge: NDArray[np.bool_]
     profile: InfluenceProfile
     place_sigma: NDArray[np.float64]
+    model_fits: bool | None = None
     __repr__ = short_repr

@@ -7,8 +7,8 @@ import os
 from pathlib import Path
 
 from escape_hw.bounded_files import MAX_TEXT_BYTES, read_bounded, shorten_path
-from escape_hw.config.key_tree import closest_match
 from escape_hw.errors import ConfigError
+from escape_hw.suggestions import closest_match
 
 _SUFFIX = ".toml"
 

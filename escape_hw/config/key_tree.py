@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import difflib
 import types
 import typing
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -15,6 +14,7 @@ from pydantic import BaseModel, Tag
 from pydantic.fields import FieldInfo
 
 from escape_hw.config.system import SystemConfig
+from escape_hw.suggestions import closest_match
 
 KeyPath = tuple[str | int, ...]
 
@@ -114,13 +114,6 @@ def _leaves(section: type[BaseModel], prefix: str) -> Iterator[str]:
             yield prefix + name
         for one in inner.values():
             yield from _leaves(one, f"{prefix}{name}.")
-
-
-def closest_match(word: str, choices: Iterable[str]) -> str | None:
-    """The choice most similar to a word in upper or lower case, or ``None``."""
-    by_lower_case = {choice.lower(): choice for choice in choices}
-    found = difflib.get_close_matches(word.lower(), by_lower_case, n=1, cutoff=0.6)
-    return by_lower_case[found[0]] if found else None
 
 
 def closest_key(path: Sequence[str | int]) -> str | None:

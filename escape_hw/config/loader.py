@@ -22,6 +22,7 @@ from escape_hw.config.system import SystemConfig
 from escape_hw.config.toml_text import format_value, key_lines, line_of, parse_toml
 from escape_hw.deprecation import warn_renamed
 from escape_hw.errors import ConfigError
+from escape_hw.suggestions import closest_match, did_you_mean
 
 #: Longest value quoted in a message, characters.
 _MAX_LENGTH = 60
@@ -66,7 +67,7 @@ def unknown_key_problem(path: Sequence[str | int], value: Any) -> ConfigProblem:
     if key_tree.locate_key(plain).existing == plain:
         others = ", ".join(f"'{kind}'" for kind in key_tree.kinds_with_key(plain))
         return ConfigProblem(plain, value, f"is a key of kind = {others} only")
-    return ConfigProblem(plain, value, f"unknown key{_hint(key_tree.closest_key(path))}")
+    return ConfigProblem(plain, value, f"unknown key{did_you_mean(key_tree.closest_key(path))}")
 
 
 def problems_from(error: ValidationError) -> list[ConfigProblem]:
@@ -130,18 +131,14 @@ def _message(detail: ErrorDetails) -> str:
 def _wrong_kind(path: KeyPath, table: Any, field: FieldInfo | None) -> ConfigProblem:
     kinds = [] if field is None else list(key_tree.sections_of(field.annotation))
     value = table["kind"]
-    hint = _hint(key_tree.closest_match(str(value), kinds))
+    hint = did_you_mean(closest_match(str(value), kinds))
     return ConfigProblem(path, value, f"must be {' or '.join(map(repr, kinds))}{hint}")
 
 
 def _wrong_choice(detail: ErrorDetails) -> str:
     expected = detail["ctx"]["expected"]
     choices = [choice.strip("'") for choice in expected.replace(" or ", ", ").split(", ")]
-    return f"must be {expected}{_hint(key_tree.closest_match(str(detail['input']), choices))}"
-
-
-def _hint(suggestion: str | None) -> str:
-    return f" (did you mean '{suggestion}'?)" if suggestion else ""
+    return f"must be {expected}{did_you_mean(closest_match(str(detail['input']), choices))}"
 
 
 #: Text accepted without quotes, which a shell removes: words, paths, network addresses.

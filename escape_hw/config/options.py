@@ -13,10 +13,11 @@ from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
 from escape_hw.config.devices import LimitsConfig
-from escape_hw.config.key_tree import closest_match, fields_of, format_path, range_text, sections_of
+from escape_hw.config.key_tree import fields_of, format_path, range_text, sections_of
 from escape_hw.config.section import RULE_ERROR, Section
 from escape_hw.errors import ConfigError
 from escape_hw.safety.limits import CAUTIOUS_LIMITS, MirrorLimits
+from escape_hw.suggestions import closest_match
 
 Options = TypeVar("Options", bound=Section)
 

@@ -16,10 +16,10 @@ from escape_hw.api.device import Device
 from escape_hw.api.emulator import EmulatorFactory, StandInBenchFactory
 from escape_hw.api.sensor import SensorGeometry
 from escape_hw.api.synthetic_model import SyntheticModel
-from escape_hw.config.key_tree import closest_match
 from escape_hw.config.system import SystemConfig
 from escape_hw.deprecation import warn_renamed
 from escape_hw.errors import ConfigError, EscapeError
+from escape_hw.suggestions import closest_match
 
 T = TypeVar("T")
 

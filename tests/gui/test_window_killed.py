@@ -50,7 +50,9 @@ def advances(bench: Connection, frames: int) -> None:
 def test_a_window_that_dies_does_not_disturb_the_loop(number: int, tmp_path: Path) -> None:
     small = tmp_path / "small.toml"
     small.write_text(configuration().to_toml())
-    with serving(small, "--set", "server.engine_silence_s=60", folder=tmp_path) as served:
+    # A busy computer may stop the engine for longer than the usual limits.
+    limits = ("--set", "server.engine_silence_s=60", "--set", "server.no_frames_s=60")
+    with serving(small, *limits, folder=tmp_path) as served:
         bench = served.connect(control=True)
         windows: list[subprocess.Popen[bytes]] = []
         try:

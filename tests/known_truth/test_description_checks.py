@@ -111,3 +111,23 @@ def test_what_clocking_adds_to_the_variances_is_its_square_on_average(true_deg: 
     # Never negative, so a little more where the angle is hardly known.
     assert (0.2 * true_deg) ** 2 * 0.97 < added < (0.2 * true_deg) ** 2 * 1.03 + 0.6 * (0.2 * 0.3) ** 2
     assert not Clocking(0.0, 0.3, np.zeros(5)).covariance.any()
+
+
+def test_y_slopes_before_x_slopes_are_named() -> None:
+    matrix = measured(0)
+    x, y = np.split(matrix.data, 2)
+    estimate = sprint(replace(matrix, data=np.concatenate([y, x])), MODEL)
+    assert not estimate.converged
+    assert "order of the slopes (matrix.slopes" in estimate.warnings[0], estimate.warnings
+
+
+def test_no_clocking_is_named_where_the_fit_did_not_converge() -> None:
+    matrix = measured(0)
+    estimate = sprint(replace(matrix, data=-clocked(matrix.data).astype(np.float32)), MODEL)
+    assert "the gain is negative" in estimate.warnings[0]
+    assert not any("clocked" in note for note in estimate.notes)
+
+
+@pytest.mark.parametrize(("angle", "named"), [(0.004, False), (0.006, True), (-0.004, False)])
+def test_an_angle_that_is_printed_as_zero_is_not_named(angle: float, named: bool) -> None:
+    assert bool(Clocking(angle, 1e-4, np.zeros(5)).describe()) is named

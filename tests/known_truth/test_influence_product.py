@@ -178,3 +178,31 @@ def test_a_matrix_without_a_fit_is_refused(product: Path, document: Any, tmp_pat
     code, told, _ = document("influence", path, "--out", tmp_path / "x.fits")
     assert code == 2
     assert "has no registration" in told["error"]["message"]
+
+
+def test_a_fit_that_did_not_converge_is_not_written(
+    product: Path, estimate: RegistrationEstimate, document: Any, tmp_path: Path
+) -> None:
+    failed = replace(estimate, converged=False, warnings=("the steps did not shrink",))
+    path = save_matrix(
+        tmp_path / "im.fits", replace(load_matrix(product).result, registration=failed),
+        config_provenance(CONFIG),
+    )  # fmt: skip
+    code, told, _ = document("influence", path, "--out", tmp_path / "x.fits")
+    assert code == 1
+    assert "did not converge: the steps did not shrink" in told["error"]["message"]
+    assert not (tmp_path / "x.fits").exists()
+
+
+@pytest.mark.parametrize("fits", [True, False, None])
+def test_a_model_that_does_not_fit_is_said_where_the_file_is_used(
+    found: InfluenceEstimate, fits: bool | None, caplog: pytest.LogCaptureFixture, escape: Any, tmp_path: Path
+) -> None:
+    file = save_influence(tmp_path / "influence.fits", replace(found, model_fits=fits), "small", True)
+    assert load_influence(file).result.model_fits is fits
+    assert ("model did not fit" in escape("show", file)[1]) is (fits is False)
+    config = small_system.configuration('devices.dm.influence="file"', f'devices.dm.influence_file="{file}"')
+    for _ in range(2):
+        make_fast_model(config, None)
+    said = [one for one in caplog.messages if "model did not fit" in one]
+    assert len(said) == (fits is False)

@@ -201,11 +201,40 @@ def test_a_modal_matrix_has_its_modes(folder):
             IncompatibleProduct,
             r"shape \(4, 4\); 21 actuators and the 21 modes",
         ),
+        ({"matrix": {"file": "im.npy", "scale": 0.0}}, IncompatibleProduct, "matrix.scale = 0; slopes must"),
+        (
+            {"matrix": {"file": "im.npy", "scale": 1e300}},
+            IncompatibleProduct,
+            "matrix.scale = 1e.300; slopes",
+        ),
+        ({"matrix": {"file": "zero.npy"}}, IncompatibleProduct, "largest element 0, times matrix.scale = 1;"),
+        ({"matrix": {"file": "complex.npy"}}, IncompatibleProduct, "elements of type complex128; save real"),
+        ({"modes": {"file": "complex.npy"}}, IncompatibleProduct, "elements of type complex128; save real"),
+        (
+            {"matrix": {"file": "several.npz"}},
+            IncompatibleProduct,
+            "arrays other, im: name one with matrix.array",
+        ),
+        (
+            {"modes": {"file": "several.npz"}},
+            IncompatibleProduct,
+            "arrays other, im: name one with modes.array",
+        ),
+        ({"sensor": {"valid": "several.npz"}}, IncompatibleProduct, "arrays other, im: save the mask alone"),
+        (
+            {"actuators": {"order": "between.txt"}},
+            IncompatibleProduct,
+            "need each whole number of 0 to 20 once",
+        ),
     ],
 )
 def test_what_does_not_fit_is_refused(folder, tables, error, text):
     write(folder / "im.npy", DATA)
     write(folder / "nan.npy", np.where(np.arange(DATA.size).reshape(DATA.shape) == 5, np.nan, DATA))
+    write(folder / "zero.npy", 0 * DATA)
+    write(folder / "complex.npy", DATA + 1j)
+    write(folder / "several.npz", DATA)
+    np.savetxt(folder / "between.txt", np.arange(21) + 0.4)
     with pytest.raises(error, match=text):
         import_arrays(describe(**{"matrix": {"file": "im.npy"}, **tables}), folder, TARGET)
 
@@ -217,8 +246,9 @@ def test_a_larger_mask_is_cut_where_nothing_is_valid(folder):
     found = import_arrays(description, folder, TARGET)
     assert np.array_equal(found.grid.valid, np.pad(MASK, 1))
     assert found.matrix.data == pytest.approx(DATA, rel=1e-6)
-    with pytest.raises(IncompatibleProduct, match="10 x 10 sub-apertures cannot be centred"):
-        import_arrays(description, folder, replace(TARGET, n_sub=2))
+    for n_sub in (2, 9):  # valid ones are outside; one row more on one side than on the other
+        with pytest.raises(IncompatibleProduct, match="10 x 10 sub-apertures cannot be centred"):
+            import_arrays(description, folder, replace(TARGET, n_sub=n_sub))
 
 
 def test_a_mask_must_fit_the_system(folder):
@@ -230,12 +260,14 @@ def test_a_mask_must_fit_the_system(folder):
 
 def test_a_wrong_description_names_its_keys(tmp_path):
     path = tmp_path / "im.toml"
-    path.write_text('[matrix]\nordr = 1\nslopes = "x"\n[sensor]\nflip_x = 1\n')
+    path.write_text('[matrix]\nordr = 1\nvalid = "m"\nslopes = "x"\n[sensor]\nflip_x = 1\n[sensr]\n')
     with pytest.raises(ConfigError) as caught:
         read_description(path)
     text = str(caught.value)
     for key in (
-        "matrix.ordr: extra inputs",
+        "matrix.ordr: unknown key (did you mean 'matrix.order'?)",
+        "matrix.valid: unknown key (did you mean 'sensor.valid'?)",
+        "sensr: unknown key (did you mean 'sensor'?)",
         "matrix.slopes: input should be 'x-y'",
         "sensor.valid: field required",
         "sensor.flip_x: input should be a valid boolean, not 1",

@@ -25,6 +25,8 @@ _NAMED_SCALING, _NAMED_STRETCH = 3.0, 0.02
 #: Clocking, in its standard errors, from which on it is named; gains of x and y slopes differ from as many
 #: standard errors on.
 _SIGNIFICANT = 3.0
+#: Smallest clocking in degrees that is named: a smaller one is printed as zero.
+_MIN_ANGLE_DEG = 0.005
 _MAX_NAMED = 8
 
 
@@ -112,14 +114,14 @@ class Clocking:
         fraction = max(1 - self.sigma_deg**2 / square, 0.0) if square else 0.0
         return np.outer(self.bias, self.bias) * fraction
 
-    def describe(self) -> str | None:
-        """A sentence for the operator; ``None`` where the angle may be chance."""
-        if abs(self.angle_deg) < _SIGNIFICANT * self.sigma_deg:
-            return None
+    def describe(self) -> tuple[str, ...]:
+        """A sentence for the operator; none where the angle may be chance or is printed as zero."""
+        if abs(self.angle_deg) < max(_SIGNIFICANT * self.sigma_deg, _MIN_ANGLE_DEG):
+            return ()
         return (
             f"the slopes are turned by {self.angle_deg:.2f} ± {self.sigma_deg:.2f} degrees against the grid "
             "of sub-apertures: the camera is clocked against the lenslets or the pyramid; the errors of the "
-            "registration include what this does to it"
+            "registration include what this does to it",
         )
 
 

@@ -1,7 +1,7 @@
 """Diagnostics of a SPRINT fit.
 
 :func:`describe_degeneracies` names parameters that the data do not separate; :func:`check_orientation` tests
-flips, quarter turns and transposition for a matrix that no registration explains.
+flips, quarter turns, transposition and the order of the slopes for a matrix that no registration explains.
 """
 
 from __future__ import annotations
@@ -103,7 +103,7 @@ _ITERATIONS = 10
 def check_orientation(
     matrix: InteractionMatrix, model: SyntheticModel, columns: NDArray[np.intp]
 ) -> str | None:
-    """Find a flip, quarter turn or transposition with which the model explains a matrix.
+    """Find a flip, quarter turn, transposition or order of the slopes with which the model explains a matrix.
 
     Returns
     -------
@@ -115,13 +115,32 @@ def check_orientation(
         return None
     weighted = weigh_low_modes(matrix, model, columns)
     for flip, reoriented in _reoriented(weighted):
-        problem = LeastSquaresProblem(reoriented, model)
-        *_, fit = problem.descend(np.zeros(5), _ITERATIONS)
-        if reoriented.explained_fraction(fit.residual) >= MIN_EXPLAINED_FRACTION * reoriented.signal_fraction:
-            sign = " and the polarity were reversed" if fit.gain < 0 else ""
-            remedy = suggest_orientation(model, flip, opposite=fit.gain < 0)
+        gain = _gain_of_fit(reoriented, model)
+        if gain is not None:
+            sign = " and the polarity were reversed" if gain < 0 else ""
+            remedy = suggest_orientation(model, flip, opposite=gain < 0)
             return f"it would if the sensor saw the pupil {_ORIENTATIONS[flip]}{sign}: {remedy}"
+    if _gain_of_fit(_exchange_slopes(weighted), model) is not None:
+        return (
+            "it would if its x slopes were its y slopes: check the order of the slopes (matrix.slopes of the "
+            "description in 'escape import arrays')"
+        )
     return None
+
+
+def _gain_of_fit(weighted: WeightedMatrix, model: DifferentiableModel) -> float | None:
+    """Gain of a registration-only fit; ``None`` if the model does not explain the matrix."""
+    *_, fit = LeastSquaresProblem(weighted, model).descend(np.zeros(5), _ITERATIONS)
+    explained = weighted.explained_fraction(fit.residual)
+    return fit.gain if explained >= MIN_EXPLAINED_FRACTION * weighted.signal_fraction else None
+
+
+def _exchange_slopes(weighted: WeightedMatrix) -> WeightedMatrix:
+    """The matrix with its x slopes as y slopes and the other way round."""
+    half = len(weighted.data) // 2
+    return replace(
+        weighted, data=np.roll(weighted.data, half, axis=0), by_slope=np.roll(weighted.by_slope, half)
+    )
 
 
 def suggest_orientation(model: SyntheticModel, flip: Flip, *, opposite: bool = False) -> str:

@@ -409,11 +409,10 @@ def _build_estimate(
         covariance[1:6, 1:6] += solution.added_covariance
     model_sigma = systematic_error(context.model)
     covariance[np.arange(1, 6), np.arange(1, 6)] += np.square(model_sigma)
+    clocking = None
     if isinstance(solution.system, NormalEquations):
         clocking = estimate_clocking(weighted, solution.system)
         covariance[1:6, 1:6] += clocking.covariance
-        remark = clocking.describe()
-        notes += () if remark is None else (remark,)
     sigma = np.sqrt(np.diag(covariance))
     between_runs = repeatability_covariance(weighted, solution.system, noise, context.model)
     # Differences between runs are not less certain than the registration itself.
@@ -422,6 +421,7 @@ def _build_estimate(
     registration = Registration.from_array(solution.alpha)
     if not warnings:
         residual = solution.system.residual
+        notes += () if clocking is None else clocking.describe()
         notes += tuple(describe_description(weighted, residual, registration, solution.state))
     numbering = numbering_covariance(context.model)
     return RegistrationEstimate(

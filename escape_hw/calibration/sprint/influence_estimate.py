@@ -95,8 +95,13 @@ def estimate_influence_functions(model: SyntheticModel, estimate: RegistrationEs
     Raises
     ------
     CalibrationError
-        The estimate has no fitted actuators, or the model no surfaces.
+        The fit did not converge, the estimate has no fitted actuators, or the model no surfaces.
     """
+    if not estimate.converged:
+        raise CalibrationError(
+            f"the fit of the registration did not converge: {'; '.join(estimate.warnings)}; its influence "
+            "functions are not to be used"
+        )
     corrections, profile = estimate.actuator_corrections, estimate.influence_profile
     if corrections is None or corrections.shape_covariance is None:
         raise CalibrationError(
@@ -123,7 +128,7 @@ def estimate_influence_functions(model: SyntheticModel, estimate: RegistrationEs
         heights, np.sqrt(np.maximum(variance, 0.0)), x, y, pitch,
         nominal + percent * corrections.position.T, percent * corrections.position_sigma.T,
         corrections.gain, corrections.gain_sigma, find_edge_actuators(nominal), profile,
-        estimate.sigma * [percent, percent, 1.0, 1.0, 1.0],
+        estimate.sigma * [percent, percent, 1.0, 1.0, 1.0], estimate.model_fits,
     )  # fmt: skip
 
 

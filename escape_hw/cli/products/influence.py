@@ -49,7 +49,7 @@ def influence(
     magnification = dm.pitch_m * dm.pitches_across_pupil / config.system.pupil_m
     origin = replace(config_provenance(config), parents={product.path.name: product.sha256})
     path = save_influence(out, found, matrix.system, matrix.simulated, magnification, origin)
-    if not registration.converged or registration.model_fits is False:
+    if registration.model_fits is False:
         context.show(registration.outcome, *registration_remarks(registration))
     context.show(
         f"influence functions of {len(found.gain)} actuators, {found.surfaces.shape[2]} x "
@@ -58,7 +58,7 @@ def influence(
     )
     context.set_subject(matrix.system, matrix.simulated, None)
     context.report(
-        im=product.path.absolute(), converged=registration.converged, profile=found.profile,
+        im=product.path.absolute(), model_fits=registration.model_fits, profile=found.profile,
         products={"influence": path.absolute()},
     )  # fmt: skip
 

@@ -61,10 +61,11 @@ def _influence(file: Path) -> ProductSummary:
     found = load_influence(file).result
     document = {
         "n_act": len(found.gain), "pitch_m": found.pitch_m, "shape": list(found.surfaces.shape[1:]),
-        "profile": asdict(found.profile),
+        "profile": asdict(found.profile), "model_fits": found.model_fits,
     }  # fmt: skip
     return document, [
         f"influence functions of {len(found.gain)} actuators, {int(found.edge.sum())} at the edge",
+        *(["of a fit whose model did not fit"] if found.model_fits is False else []),
         *profile_lines(found.profile),
     ]
 

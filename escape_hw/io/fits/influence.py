@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from astropy.io import fits as astropy_fits
 
-from escape_hw.api.influence import PLACE_CARDS, InfluenceEstimate
+from escape_hw.api.influence import MODEL_FITS_CARD, PLACE_CARDS, InfluenceEstimate
 from escape_hw.io.fits import extensions as fits_parts
 from escape_hw.io.fits import file as fits_file
 from escape_hw.io.fits.file import Product
@@ -37,6 +37,7 @@ def save_influence(
 
     The maps are the first image, ``INFLUENC (n_act, n_y, n_x)``, with the coordinates of their pixels on the
     mirror in the header, so that ``devices.dm.influence = "file"`` needs no further keys.
+    The card ``MODELFIT`` says whether the model of the fit fits, where this was judged.
 
     Parameters
     ----------
@@ -73,7 +74,12 @@ def save_influence(
         fits_file.table_extension("POSITIONS", columns),
         fits_parts.pack_profile(estimate.profile),
     ]
-    return fits_file.write_product(Path(path), KIND_INFLUENCE, hdus, system, simulated, origin)
+    fit_cards = {}
+    if estimate.model_fits is not None:
+        fit_cards[MODEL_FITS_CARD] = (estimate.model_fits, "F: the model did not fit")
+    return fits_file.write_product(
+        Path(path), KIND_INFLUENCE, hdus, system, simulated, origin, cards=fit_cards
+    )
 
 
 def load_influence(path: Path | str) -> InfluenceProduct:
@@ -105,4 +111,5 @@ def _unpack(path: Path, hdus: astropy_fits.HDUList, header: dict[str, Any]) -> I
     return InfluenceEstimate(
         surfaces, sigma, x, y, float(cards["PITCH"]), positions[:, :2], positions[:, 2:], gain, gain_sigma,
         edge > 0, profile, np.array([float(cards[name]) for name in PLACE_CARDS]),
+        bool(header[MODEL_FITS_CARD]) if MODEL_FITS_CARD in header else None,
     )  # fmt: skip

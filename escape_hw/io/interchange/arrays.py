@@ -15,15 +15,17 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic_core import ErrorDetails
 
 from escape_hw.api.flips import turn_image
 from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.pyramid import PyramidPupils
 from escape_hw.api.results import CalibrationResult
 from escape_hw.api.sensor import SensorGeometry, SubApertureGrid
-from escape_hw.array_files import read_array
+from escape_hw.array_files import array_names, read_array
 from escape_hw.bounded_files import MAX_TEXT_BYTES, read_bounded
 from escape_hw.errors import ConfigError, IncompatibleProduct
+from escape_hw.suggestions import closest_match, did_you_mean
 
 #: Response of a pixel, relative to the largest, below which ``valid = "nonzero"`` counts it as zero.
 _ZERO = 1e-12
@@ -76,8 +78,8 @@ class SensorTable(_Table):
     valid
         Mask of the valid sub-apertures in the file's orientation: the name of a file, or ``"nonzero"`` for
         maps (those with any response). A mask of two maps, beside or above each other, may be given for x
-        and y. A mask smaller than the system's ``n_sub`` is centred on it; a larger one is cut where it has
-        no valid sub-apertures.
+        and y. A mask smaller than the system's ``n_sub`` is centred on it; of a larger one equal margins
+        without valid sub-apertures are cut.
     transpose, flip_x, flip_y
         What makes the camera's image that of the system: rows and columns exchanged, then mirrored along x
         (columns) and y (rows). Slopes are exchanged and change their signs with it.
@@ -183,15 +185,33 @@ def read_description(path: Path) -> ArrayDescription:
         document = tomllib.loads(read_bounded(path, MAX_TEXT_BYTES).decode("utf-8"))
         return ArrayDescription.model_validate(document)
     except ValidationError as error:
-        lines = [
-            f"{path}  {'.'.join(map(str, one['loc']))}: {one['msg'][:1].lower()}{one['msg'][1:]}"
-            f"{'' if one['type'] == 'missing' else ', not ' + repr(one['input'])}"
-            for one in error.errors(include_url=False)
-        ]
+        details = error.errors(include_url=False)
+        lines = [f"{path}  {'.'.join(map(str, one['loc']))}: {_problem(one)}" for one in details]
         raise ConfigError("\n".join(lines)) from error
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) and error.strerror else error
         raise ConfigError(f"{path}: cannot be read ({reason})") from error
+
+
+def _problem(detail: ErrorDetails) -> str:
+    """What is wrong with a key of the description."""
+    if detail["type"] == "extra_forbidden":
+        return f"unknown key{did_you_mean(_closest_key([str(step) for step in detail['loc']]))}"
+    value = "" if detail["type"] == "missing" else f", not {detail['input']!r}"
+    return f"{detail['msg'][:1].lower()}{detail['msg'][1:]}{value}"
+
+
+def _closest_key(path: list[str]) -> str | None:
+    """Suggestion for an unknown key: a similar one of its table, or the same name in another table."""
+    fields = ArrayDescription.model_fields.items()
+    keys = {table: list(getattr(field.annotation, "model_fields", {})) for table, field in fields}
+    if len(path) == 1:
+        return closest_match(path[0], keys)
+    table, key = path
+    neighbour = closest_match(key, keys[table])
+    if neighbour is not None:
+        return f"{table}.{neighbour}"
+    return next((f"{other}.{key}" for other in keys if key in keys[other]), None)
 
 
 def import_arrays(
@@ -217,7 +237,7 @@ def import_arrays(
     if file is None and not table.file:
         raise ConfigError("matrix.file of the description is empty; name the file there, or with --im")
     path = file or folder / table.file
-    array = np.asarray(read_array(path, table.array), dtype=np.float64)
+    array = _read_numbers(path, table.array)
     if not np.isfinite(array).all():
         n = int((~np.isfinite(array)).sum())
         raise IncompatibleProduct(
@@ -228,17 +248,43 @@ def import_arrays(
     padded = _centre_mask(valid, target.n_sub)
     order = actuator_order(description.actuators, target, folder)
     m2c, columns = _commands(path, description, folder, x.shape[1], order)
-    data = table.scale * description.actuators.sign * np.concatenate([x, y])[:, columns]
+    data = _scale(path, table.scale, description.actuators.sign * np.concatenate([x, y])[:, columns])
     notes = [f"read from {path.name}"]
     if not table.sigma:
         notes.append("it has no standard errors; uncertainties of a registration assume equal ones")
     grid = design_geometry(padded, target)
     simulated = target.simulated if table.simulated is None else table.simulated
     matrix = InteractionMatrix(
-        data.astype(np.float32), np.full(data.shape, abs(table.scale) * table.sigma, np.float32), m2c, padded,
+        data, np.full(data.shape, abs(table.scale) * table.sigma, np.float32), m2c, padded,
         target.system, table.method, simulated, slope_unit=grid.slope_unit,
     )  # fmt: skip
     return CalibrationResult(matrix, grid, 0, 0, 0.0, notes=tuple(notes))
+
+
+def _read_numbers(path: Path, name: str = "") -> NDArray[np.float64]:
+    """An array of real numbers; others are refused."""
+    array = read_array(path, name)
+    if array.dtype.kind not in "biuf":
+        raise IncompatibleProduct(f"{path}: has elements of type {array.dtype}; save real numbers")
+    return np.asarray(array, dtype=np.float64)
+
+
+def _scale(path: Path, scale: float, data: NDArray[np.float64]) -> NDArray[np.float32]:
+    """The matrix in ESCAPE's unit; a product without any response, or beyond the numbers, is refused."""
+    with np.errstate(over="ignore"):
+        scaled = (scale * data).astype(np.float32)
+    if not (np.isfinite(scaled).all() and scaled.any()):
+        raise IncompatibleProduct(
+            f"{path}: largest element {np.abs(data).max(initial=0):g}, times matrix.scale = {scale:g}; "
+            "slopes must be finite and not all zero"
+        )
+    return scaled
+
+
+def _name_arrays(path: Path, remedy: str) -> str:
+    """The arrays of a file with several and what to do, for a message; empty for other files."""
+    names = array_names(path)
+    return f"; {path.name} has the arrays {', '.join(names)}: {remedy}" if len(names) > 1 else ""
 
 
 def _slopes_of_commands(
@@ -246,9 +292,13 @@ def _slopes_of_commands(
 ) -> tuple[NDArray[np.bool_], NDArray[np.float64], NDArray[np.float64]]:
     """Mask, and x and y slopes ``(n_valid, n_commands)``, in the file's orientation."""
     table, name = description.matrix, description.sensor.valid
-    if table.order.startswith("maps"):
-        if array.ndim != 3:
-            raise IncompatibleProduct(f"{path}: has shape {array.shape}; {table.order!r} needs 3 axes")
+    n_axes = 3 if table.order.startswith("maps") else 2
+    if array.ndim != n_axes:
+        others = _name_arrays(path, "name one with matrix.array")
+        raise IncompatibleProduct(
+            f"{path}: has shape {array.shape}; {table.order!r} needs {n_axes} axes{others}"
+        )
+    if n_axes == 3:
         maps = _split_maps(path, array, table.order == "maps-beside")
         seen = np.abs(maps).max(axis=(0, 1))
         valid = seen > _ZERO * seen.max() if name == "nonzero" else _read_mask(folder / name)
@@ -260,8 +310,6 @@ def _slopes_of_commands(
         return valid, x, y
     if name == "nonzero":
         raise IncompatibleProduct(f"{path}: sensor.valid = 'nonzero' needs maps of slopes; name a mask")
-    if array.ndim != 2:
-        raise IncompatibleProduct(f"{path}: has shape {array.shape}; {table.order!r} needs 2 axes")
     valid = _read_mask(folder / name)
     data, n = array.T if table.order == "commands-slopes" else array, int(valid.sum())
     if len(data) != 2 * n:
@@ -285,7 +333,8 @@ def _read_mask(path: Path) -> NDArray[np.bool_]:
     """A mask, of which the two for x and y must be equal."""
     mask = read_array(path) != 0
     if mask.ndim != 2:
-        raise IncompatibleProduct(f"{path}: has shape {mask.shape}; a mask has rows and columns")
+        others = _name_arrays(path, "save the mask alone")
+        raise IncompatibleProduct(f"{path}: has shape {mask.shape}; a mask has rows and columns{others}")
     for axis in (0, 1):
         if mask.shape[axis] == 2 * mask.shape[1 - axis]:
             first, second = np.split(mask, 2, axis=axis)
@@ -310,18 +359,16 @@ def _turn_camera(
 
 
 def _centre_mask(valid: NDArray[np.bool_], n_sub: int) -> NDArray[np.bool_]:
-    """The mask on ``n_sub x n_sub``; a larger one is cut where it has no valid sub-apertures."""
-    missing = n_sub - np.array(valid.shape)
-    cut = [slice(-int(m) // 2, int(m) // 2) if m < 0 else slice(None) for m in missing]
-    shape = valid.shape
-    valid, all_valid = valid[tuple(cut)], int(valid.sum())
-    missing = np.maximum(missing, 0)
-    if int(valid.sum()) < all_valid or ((n_sub - np.array(valid.shape)) % 2).any():
+    """The mask on ``n_sub x n_sub``; a larger one is cut by equal margins without valid sub-apertures."""
+    margins = [(n_sub - n) / 2 for n in valid.shape]
+    cut = tuple(slice(int(-m), int(m)) if m < 0 else slice(None) for m in margins)
+    if any(m % 1 for m in margins) or valid[cut].sum() < valid.sum():
         raise IncompatibleProduct(
-            f"the mask of {shape[0]} x {shape[1]} sub-apertures cannot be centred on sensor.n_sub = {n_sub}; "
-            "correct sensor.n_sub of the system (--set sensor.n_sub=N)"
+            f"the mask of {valid.shape[0]} x {valid.shape[1]} sub-apertures cannot be centred on "
+            f"sensor.n_sub = {n_sub}; correct sensor.n_sub of the system (--set sensor.n_sub=N), or the "
+            "empty rows and columns of the mask"
         )
-    return np.pad(valid, [(int(m) // 2, int(m) // 2) for m in missing])
+    return np.pad(valid[cut], [(max(int(m), 0),) * 2 for m in margins])
 
 
 def actuator_order(table: ActuatorTable, target: ArrayTarget, folder: Path = Path()) -> NDArray[np.intp]:
@@ -333,19 +380,21 @@ def actuator_order(table: ActuatorTable, target: ArrayTarget, folder: Path = Pat
         The order is no permutation of the system's actuators, or flips are asked for without a grid.
     """
     turned = table.transpose or table.flip_x or table.flip_y
+    order: NDArray[np.intp] | NDArray[np.float64]
     if not table.order:
         order = np.arange(target.n_act) if not turned else _order_on_grid(table, target)
     elif turned:
         raise ConfigError("actuators.order gives the numbering; remove transpose, flip_x and flip_y")
+    elif isinstance(table.order, str):
+        order = _read_numbers(folder / table.order).ravel()
     else:
-        given = read_array(folder / table.order) if isinstance(table.order, str) else np.array(table.order)
-        order = np.asarray(given, dtype=np.intp).ravel()
+        order = np.array(table.order, dtype=np.intp)
     if not np.array_equal(np.sort(order), np.arange(target.n_act)):
         raise IncompatibleProduct(
             f"actuators.order has {order.size} numbers; the {target.n_act} actuators of system "
-            f"'{target.system}' need each of 0 to {target.n_act - 1} once"
+            f"'{target.system}' need each whole number of 0 to {target.n_act - 1} once"
         )
-    return order
+    return order.astype(np.intp)
 
 
 def _order_on_grid(table: ActuatorTable, target: ArrayTarget) -> NDArray[np.intp]:
@@ -372,13 +421,14 @@ def _commands(
             )
         # Single actuators, in our numbering.
         return np.eye(n), np.argsort(order)
-    m2c = np.asarray(read_array(folder / description.modes.file, description.modes.array), dtype=np.float64)
+    m2c = _read_numbers(folder / description.modes.file, description.modes.array)
     if m2c.shape == (n, order.size) and n != order.size:
         m2c = m2c.T
     if m2c.shape != (order.size, n):
+        others = _name_arrays(folder / description.modes.file, "name one with modes.array")
         raise IncompatibleProduct(
             f"{description.modes.file}: has shape {m2c.shape}; {order.size} actuators and the {n} modes of "
-            f"{path.name} need ({order.size}, {n})"
+            f"{path.name} need ({order.size}, {n}){others}"
         )
     return m2c[np.argsort(order)], np.arange(n)
 

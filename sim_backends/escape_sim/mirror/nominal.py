@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import logging
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from astropy.io import fits
 
+from escape_hw.api.influence import MODEL_FITS_CARD
 from escape_hw.errors import ConfigError
 from escape_sim.mirror.influence_functions import (
     InfluenceFunctions,
@@ -24,6 +27,8 @@ if TYPE_CHECKING:
 
 #: Influence functions that are kept: building those of a plate or a large file takes seconds.
 _MAX_CACHED = 8
+
+log = logging.getLogger(__name__)
 
 
 def gaussian_functions(config: SystemConfig) -> InfluenceFunctions:
@@ -81,8 +86,22 @@ def _from_file(
     pitch_m: float,
 ) -> MeasuredInfluenceFunctions:
     maps = read_maps(file, np.array(positions), settings)
+    _warn_of_misfit(file)
     return MeasuredInfluenceFunctions(
         maps.surfaces, maps.pixel * pitch_m, positions_m=maps.positions * pitch_m,
         centre_px=maps.centre_px, orientation=maps.orientation,
         place_sigma=np.multiply(maps.sigma, [pitch_m, pitch_m, 1, 1, 1]).tolist(),
     )  # fmt: skip
+
+
+def _warn_of_misfit(file: str) -> None:
+    """Warn of a product of ``escape influence`` whose model did not fit; other files have no such card."""
+    try:
+        header = fits.getheader(file)
+    except OSError:  # not FITS
+        return
+    if header.get(MODEL_FITS_CARD) is False:
+        log.warning(
+            "devices.dm.influence_file: %s is of a fit whose model did not fit; its influence functions may "
+            "be wrong beyond their errors ('escape influence' prints what does not fit)", file,
+        )  # fmt: skip
