@@ -114,8 +114,8 @@ def test_thirty_registrations_short_and_two_seconds() -> None:
             assert _meets_goal(curves, estimator, frames)
             at = curves["frames"].index(frames)
             for name in PARAMETERS:
-                # The matrix route states shift and rotation up to twice as large as it errs on mirrors
-                # that are nearly as its model has them: its errors contain those of other mirrors.
-                least = 0.5 if estimator == "telemetry" else 0.25
+                # The matrix route states shift and rotation up to three times as large as it errs on
+                # mirrors that are nearly as its model has them: its errors contain those of other mirrors.
+                least = 0.5 if estimator == "telemetry" else 0.11
                 assert least <= curves["chi2"][estimator][name][at] <= 2.0, (estimator, frames, name)
     assert (np.array([curves["bound"][p][0] for p in PARAMETERS]) < GOAL).all()
