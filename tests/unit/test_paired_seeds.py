@@ -126,6 +126,7 @@ def test_the_interval_is_students():
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(900)  # calibrations and loops of two benches: against hanging, and not for speed
 def test_two_seeds_of_the_twin():
     changes = [
         "basis.n_modes=12", "calibration.sprint_modes=12", "calibration.poke=0.02",
