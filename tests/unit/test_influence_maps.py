@@ -207,6 +207,8 @@ def test_positions_that_are_given_are_compared_with_the_maps(tmp_path: Path) -> 
     settings = MapSettings(positions="layout", pixel_m=1 / FINE)
     with pytest.raises(ConfigError, match="have their peak far from the actuator"):
         read_maps(written(tmp_path, turned), LAYOUT, settings)
+    # The piston of a map, which an interferometer does not measure, is no peak.
+    assert read_maps(written(tmp_path, truth() - 1.0), LAYOUT, settings).positions == pytest.approx(LAYOUT)
     header |= {"CRPIX1": 1000.0}
     with pytest.raises(ConfigError, match="no actuator has its place on the maps"):
         read_maps(written(tmp_path, truth(), **header), LAYOUT, MapSettings(pitch_m=2e-3))

@@ -155,10 +155,10 @@ def read_maps(file: str, layout: NDArray[np.float64], settings: MapSettings | No
         )
     maps = _place(file, content, layout, settings)
     maps = _bin(maps)
+    maps = maps._replace(surfaces=_without_offsets(maps))
     _require_own_peaks(file, maps)
     _require_tilt(file, maps)
-    surfaces = _without_offsets(maps)
-    surfaces = surfaces * _scale(file, maps._replace(surfaces=surfaces), content.header, settings)
+    surfaces = maps.surfaces * _scale(file, maps, content.header, settings)
     maps = _extend(maps._replace(surfaces=surfaces), layout)
     surfaces = fill_gaps(maps.surfaces, 1 / maps.pixel)
     if maps.pixel * _MIN_FILTERED <= 1:
