@@ -206,3 +206,16 @@ def test_a_model_that_does_not_fit_is_said_where_the_file_is_used(
         make_fast_model(config, None)
     said = [one for one in caplog.messages if "model did not fit" in one]
     assert len(said) == (fits is False)
+
+
+@pytest.mark.parametrize(("simulated", "mode"), [(True, "hardware"), (False, "hardware"), (True, "sim")])
+def test_influence_functions_of_a_twin_are_told_from_those_of_a_real_mirror(
+    found: InfluenceEstimate, simulated: bool, mode: str, caplog: pytest.LogCaptureFixture, tmp_path: Path
+) -> None:
+    file = save_influence(tmp_path / "influence.fits", found, "small", simulated)
+    config = small_system.configuration(
+        'devices.dm.influence="file"', f'devices.dm.influence_file="{file}"', f'devices.dm.mode="{mode}"'
+    )
+    make_fast_model(config, None)
+    said = [one for one in caplog.messages if "made on a twin" in one]
+    assert len(said) == (simulated and mode == "hardware")

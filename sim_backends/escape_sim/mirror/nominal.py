@@ -62,7 +62,8 @@ def nominal_influence_functions(config: SystemConfig) -> InfluenceFunctions | Me
         status = file.stat()
     except (OSError, ValueError) as error:
         raise ConfigError(f"devices.dm.influence_file: {file} cannot be read: {error}") from error
-    return _from_file(str(file), (status.st_mtime_ns, status.st_size), positions, settings, pitch)
+    hardware = (mirror.mode or config.system.mode) == "hardware"
+    return _from_file(str(file), (status.st_mtime_ns, status.st_size), positions, settings, pitch, hardware)
 
 
 @lru_cache(_MAX_CACHED)
@@ -84,9 +85,10 @@ def _from_file(
     positions: tuple[tuple[float, ...], ...],
     settings: MapSettings,
     pitch_m: float,
+    hardware: bool,
 ) -> MeasuredInfluenceFunctions:
     maps = read_maps(file, np.array(positions), settings)
-    _warn_of_misfit(file)
+    _warn_of_origin(file, hardware)
     return MeasuredInfluenceFunctions(
         maps.surfaces, maps.pixel * pitch_m, positions_m=maps.positions * pitch_m,
         centre_px=maps.centre_px, orientation=maps.orientation,
@@ -94,8 +96,11 @@ def _from_file(
     )  # fmt: skip
 
 
-def _warn_of_misfit(file: str) -> None:
-    """Warn of a product of ``escape influence`` whose model did not fit; other files have no such card."""
+def _warn_of_origin(file: str, hardware: bool) -> None:
+    """Warn of a product of ``escape influence`` whose model did not fit, or of a twin for a real mirror.
+
+    Other files do not have its cards.
+    """
     try:
         header = fits.getheader(file)
     except OSError:  # not FITS
@@ -104,4 +109,9 @@ def _warn_of_misfit(file: str) -> None:
         log.warning(
             "devices.dm.influence_file: %s is of a fit whose model did not fit; its influence functions may "
             "be wrong beyond their errors ('escape influence' prints what does not fit)", file,
+        )  # fmt: skip
+    if hardware and header.get("SIMULATE") is True:
+        log.warning(
+            "devices.dm.influence_file: %s was made on a twin (SIMULATE = T), the mirror is real: measure "
+            "its influence functions, or calibrate it and run 'escape influence' on the result", file,
         )  # fmt: skip
