@@ -6,6 +6,7 @@ from collections import deque
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import brentq
 
 from escape_hw.api.sensor import SensorGeometry, SubApertureGrid
 
@@ -15,6 +16,8 @@ _LAG_FRAMES = 2
 _MAX_BLOCKS = 8
 #: Share of the slopes' variance below which turbulence cannot be distinguished from noise.
 _MIN_TURBULENCE_FRACTION = 0.02
+#: Correlation times between which that of the turbulence is searched, relative to the run.
+_CORRELATION_TIMES = (1e-4, 1e3)
 #: Block length of the focus regression in seconds: long for vibrations and pokes, short for the wind to cross
 #: the pupil.
 _BLOCK_S = 0.05
@@ -34,7 +37,7 @@ class SlopeStatistics:
         self._n_frames = 0
         self._sum = np.zeros(n_slopes)
         self._sum_of_squares = np.zeros(n_slopes)
-        self._poke_power = self._lag_products = self._tilt_power = 0.0
+        self._poke_power = self._lag_products = self._tilt_power = self._tilt_lag_products = 0.0
         self._n_lag_pairs = 0
         self._recent_slopes: deque[NDArray[np.float32]] = deque(maxlen=_LAG_FRAMES)
         self._blocks, self._block_length = [np.zeros(n_slopes)], 1
@@ -47,14 +50,16 @@ class SlopeStatistics:
                 self._block_length *= 2
             self._blocks.append(np.zeros(self.n_slopes))
         self._blocks[-1] += slopes
+        tilt = _tilts(slopes)
         if len(self._recent_slopes) == _LAG_FRAMES:
             self._lag_products += float(self._recent_slopes[0] @ slopes)
+            self._tilt_lag_products += float((_tilts(self._recent_slopes[0]) * tilt).mean())
             self._n_lag_pairs += 1
         self._recent_slopes.append(slopes.copy())
         self._n_frames += 1
         self._sum += slopes
         self._sum_of_squares += np.square(slopes, dtype=np.float64)
-        self._tilt_power += float(np.square(slopes.reshape(2, -1).mean(axis=1, dtype=np.float64)).mean())
+        self._tilt_power += float(np.square(tilt).mean())
         if poke is not None:
             self._poke_power += float(poke @ poke)
 
@@ -63,8 +68,7 @@ class SlopeStatistics:
         self._n_frames += len(slopes)
         self._sum += slopes.sum(axis=0, dtype=np.float64)
         self._sum_of_squares += np.einsum("ts,ts->s", slopes, slopes, dtype=np.float64)
-        tilts = slopes.reshape(len(slopes), 2, -1).mean(axis=2, dtype=np.float64)
-        self._tilt_power += float(np.square(tilts).mean(axis=1).sum())
+        self._tilt_power += float(np.square(_tilts(slopes)).mean(axis=1).sum())
 
     def state(self) -> NDArray[np.float64]:
         """All sums and counts ``(7 + blocks, n_slopes)``, for :meth:`restore`."""
@@ -77,8 +81,8 @@ class SlopeStatistics:
         )
         rows = (np.full(self.n_slopes, number) for number in numbers)
         out = np.stack([self._sum, self._sum_of_squares, *rows, *self._blocks])
-        # Version 0.1.0, whose states can be resumed, has the number of frames here as well.
-        out[2, 1] = self._tilt_power
+        # States of older versions, which can be resumed, have the number of frames here as well.
+        out[2, 1:3] = self._tilt_power, self._tilt_lag_products
         return out
 
     def restore(self, state: NDArray[np.float64]) -> None:
@@ -87,6 +91,7 @@ class SlopeStatistics:
         self._poke_power, self._lag_products = float(state[3, 0]), float(state[4, 0])
         self._n_lag_pairs, self._block_length = int(state[5, 0]), int(state[6, 0])
         self._tilt_power = float(state[2, 1]) if state[2, 1] != state[2, 0] else 0.0
+        self._tilt_lag_products = float(state[2, 2]) if state[2, 2] != state[2, 0] else np.nan
         self._blocks = [row.copy() for row in state[7:]]
         self._recent_slopes.clear()
 
@@ -102,7 +107,7 @@ class SlopeStatistics:
         variance = float(np.maximum(mean_squares - np.square(self._sum / self._n_frames), 0).mean())
         poke_rms = float(np.sqrt(self._poke_power / self._n_frames))
         persistent_fraction = self._persistence(variance)
-        n_effective = self._effective_samples(variance, persistent_fraction if poke_rms else 1.0)
+        n_effective = self._effective_samples(variance, persistent_fraction, poked=poke_rms > 0)
         return grid.with_slope_statistics(
             float(np.sqrt(variance)), poke_rms, n_effective, 0.0 if closed else persistent_fraction,
             self._tilt_rms() if closed else 0.0,
@@ -122,7 +127,7 @@ class SlopeStatistics:
 
     def _tilt_rms(self) -> float:
         """Rms per axis of the slopes' mean over the pupil, about its mean over time."""
-        mean = np.square(self._sum.reshape(2, -1).mean(axis=1) / self._n_frames).mean()
+        mean = np.square(_tilts(self._sum) / self._n_frames).mean()
         return float(np.sqrt(max(self._tilt_power / self._n_frames - mean, 0.0)))
 
     def _persistence(self, variance: float) -> float:
@@ -133,21 +138,66 @@ class SlopeStatistics:
         correlation = (self._lag_products / self._n_lag_pairs - mean) / (variance * self.n_slopes)
         return float(np.clip(correlation, 0.0, 1.0))
 
-    def _effective_samples(self, variance: float, turbulence_fraction: float) -> float:
-        """Number of independent samples of the turbulence, from the variance of means over blocks.
+    def _effective_samples(self, variance: float, persistent_fraction: float, *, poked: bool) -> float:
+        """Number of independent realisations of the turbulence: of the slopes, or of their tilts if fewer.
 
-        The variance of a mean over ``L`` frames is ``variance * tau / L`` with the integral ``tau`` of the
-        correlation, once ``L`` exceeds it. Pokes are new in every frame, so all but ``turbulence_fraction``
-        of the variance has a ``tau`` of one frame.
+        The large scales of the turbulence last longest, and change the sensitivity of a pyramid most.
         """
-        complete_blocks = self._blocks[: self._n_frames // self._block_length]
-        if len(complete_blocks) < _MAX_BLOCKS // 2 or not variance > 0:
+        n_full = self._n_frames // self._block_length
+        if n_full < _MAX_BLOCKS // 2 or not variance > 0:
             return 0.0
-        block_variance = float(np.var(np.stack(complete_blocks) / self._block_length, axis=0, ddof=1).mean())
-        tau = self._block_length * block_variance / variance
-        if turbulence_fraction > _MIN_TURBULENCE_FRACTION:
-            tau = (tau - 1 + turbulence_fraction) / turbulence_fraction
-        return self._n_frames / max(tau, 1.0)
+        blocks = np.stack(self._blocks)
+        n_effective = self._realisations(blocks, variance, persistent_fraction if poked else 1.0)
+        tilt_variance = self._tilt_rms() ** 2
+        if tilt_variance > 0:
+            mean = np.square(_tilts(self._sum) / self._n_frames).mean()
+            fraction = (self._tilt_lag_products / self._n_lag_pairs - mean) / tilt_variance
+            fraction = float(np.clip(fraction, 0.0, 1.0)) if poked and np.isfinite(fraction) else 1.0
+            n_effective = min(n_effective, self._realisations(_tilts(blocks), tilt_variance, fraction))
+        return n_effective
+
+    def _realisations(
+        self, blocks: NDArray[np.float64], variance: float, turbulence_fraction: float
+    ) -> float:
+        """Independent realisations in the run, from the sums over its blocks ``(n_blocks, n)``.
+
+        The turbulence, ``turbulence_fraction`` of the variance, has an exponential correlation; noise and
+        pokes are new in every frame. The correlation time is that whose variances of frames and of block
+        means about the mean of the run have the measured ratio; without the mean of the run in the theory,
+        turbulence that outlasts the run would not be noticed.
+        """
+        if turbulence_fraction <= _MIN_TURBULENCE_FRACTION:
+            return float(self._n_frames)
+        n_frames = np.full(len(blocks), float(self._block_length))
+        n_frames[-1] = self._n_frames - n_frames[:-1].sum()
+        weights = n_frames / self._n_frames
+        deviations = blocks / n_frames[:, None] - blocks.sum(axis=0) / self._n_frames
+        between = float(weights @ np.square(deviations).mean(axis=1))
+        between -= (1 - turbulence_fraction) * variance * (len(blocks) - 1) / self._n_frames
+        ratio = between / (turbulence_fraction * variance)
+
+        def excess(correlation_time: float) -> float:
+            run = _variance_of_mean(1 / correlation_time)
+            block = sum(w * _variance_of_mean(w / correlation_time) for w in weights)
+            return float((block - run) / (1 - run)) - ratio
+
+        shortest, longest = _CORRELATION_TIMES
+        if excess(longest) <= 0:
+            return 1.0
+        if excess(shortest) >= 0:
+            return float(self._n_frames)
+        correlation_time = float(brentq(excess, shortest, longest))
+        return min(1 / _variance_of_mean(1 / correlation_time), float(self._n_frames))
+
+
+def _tilts(slopes: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Means of the x and of the y slopes over the pupil ``(..., 2)``."""
+    return np.asarray(slopes.reshape(*slopes.shape[:-1], 2, -1).mean(axis=-1, dtype=np.float64))
+
+
+def _variance_of_mean(duration: float) -> float:
+    """Variance of the mean of an exponential correlation over ``duration`` correlation times."""
+    return float(2 * (duration - 1 + np.exp(-duration)) / duration**2)
 
 
 class StaticFocusEstimator:

@@ -129,10 +129,12 @@ def _noise_score_covariance(
     return np.asarray(scores.reshape(len(scores), -1) @ correlated.T)
 
 
-def _positive_part(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The part of a symmetric matrix with positive eigenvalues."""
-    values, directions = np.linalg.eigh((matrix + matrix.T) / 2)
-    return np.asarray((directions * np.maximum(values, 0.0)) @ directions.T)
+def _with_variances(matrix: NDArray[np.float64], variances: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The covariance ``(n, n)`` with other variances ``(n,)`` and the same correlations."""
+    own = np.diag(matrix)
+    known = own > 0
+    scale = np.sqrt(np.divide(variances, own, out=np.zeros_like(own), where=known))
+    return np.asarray(matrix * np.outer(scale, scale) + np.diag(np.where(known, 0.0, variances)))
 
 
 def _resampled_covariance(
@@ -205,18 +207,24 @@ def sandwich_covariance(
 ) -> NDArray[np.float64]:
     """Sandwich covariance of the common parameters, in their units.
 
-    The middle factor is the covariance of the scores. Its noise part follows from the covariance of the
-    noise, where that is known: turbulence correlates neighbouring sub-apertures. Its part due to the misfit
-    of the model is estimated from the scatter of the scores over the pupil: products of scores are weighted
-    with a Bartlett window that falls to zero at half the pupil (as in Newey & West 1987 over time), and
-    only their excess over the noise is added, because the scores at a solution sum to zero and the window
-    alone would underestimate the noise. Without a covariance of the noise the window is used for both, plus
-    the scatter of the scores from mode to mode, which contains errors common to all slopes during the
-    measurement of a mode. What differences between the actuators and errors of the model of the sensor can
-    do to the parameters beyond that is estimated by leaving out groups of actuators and of slopes
-    (:func:`_resampled_covariance`, :func:`_resampled_by_slopes`). A reduced chi-squared above one multiplies
-    the whole covariance (the scale factor of Birge 1932): a misfit that all groups share, such as that of
-    another family of influence functions, does not show when some are left out.
+    The middle factor is the covariance of the scores due to the noise. It follows from the covariance of the
+    noise, where that is known: turbulence correlates neighbouring sub-apertures. Otherwise it is estimated
+    from the scatter of the scores over the pupil: products of scores are weighted with a Bartlett window
+    that falls to zero at half the pupil (as in Newey & West 1987 over time), plus the scatter of the scores
+    from mode to mode, which contains errors common to all slopes during the measurement of a mode.
+
+    Misfits of the model are in the residual as well, so each of the following estimates the whole variance
+    of a parameter, and the largest is stated:
+
+    - the noise, plus what the scatter of the scores over the pupil exceeds that of the noise (only the
+      excess: the scores at a solution sum to zero, and the window alone would underestimate the noise);
+    - independent errors of the slopes;
+    - leaving out groups of slopes, or groups of actuators (:func:`_resampled_by_slopes`,
+      :func:`_resampled_covariance`).
+
+    A reduced chi-squared above one multiplies the whole covariance (the scale factor of Birge 1932): a
+    misfit that all groups share, such as that of another family of influence functions, does not show when
+    some are left out.
 
     Parameters
     ----------
@@ -234,23 +242,22 @@ def sandwich_covariance(
     power = weighted.noise_level(system.residual) ** 2
     if noise is None:
         by_mode = element_scores.sum(axis=1)
-        meat += by_mode @ by_mode.T
+        covariance = bread @ (meat + by_mode @ by_mode.T) @ bread
+        excess = np.zeros(len(bread))
     else:
         # A slope without variance is uncorrelated with all others.
         standard_deviation = np.where(np.diag(noise) > 0, np.sqrt(np.diag(noise)), np.inf)
         correlation = power * noise / np.outer(standard_deviation, standard_deviation)
         near_correlation = np.tile(_proximity(valid), (2, 2)) * correlation
-        meat = _noise_score_covariance(scores, correlation) + _positive_part(
-            meat - _noise_score_covariance(scores, near_correlation)
-        )
-    estimate = bread @ meat @ bread
-    # Not smaller than the errors due to noise alone; a parameter that moves no slope has those of its prior.
-    least, scatter = power * np.diag(bread), np.diag(estimate)
-    moves = scatter > 0
-    scale = np.sqrt(np.maximum(np.divide(least, scatter, out=np.ones_like(least), where=moves), 1.0))
-    covariance = estimate * np.outer(scale, scale) + np.diag(np.where(moves, 0.0, least))
-    by_slopes = _resampled_by_slopes(system.information(), scores, system.residual, valid)
-    covariance = covariance + _positive_part(by_slopes - estimate)
-    resampled = _resampled_covariance(system.information(), scores, system.residual, weighted.modes)
-    covariance = covariance + _positive_part(resampled - covariance)
-    return np.asarray(covariance * max(weighted.reduced_chi_squared(system.residual) / power, 1.0))
+        covariance = bread @ _noise_score_covariance(scores, correlation) @ bread
+        near = _noise_score_covariance(scores, near_correlation)
+        excess = np.maximum(np.diag(bread @ (meat - near) @ bread), 0.0)
+    information = system.information()
+    estimates = (
+        np.diag(covariance) + excess,
+        power * np.diag(bread),
+        np.diag(_resampled_by_slopes(information, scores, system.residual, valid)),
+        np.diag(_resampled_covariance(information, scores, system.residual, weighted.modes)),
+    )
+    scale_factor = max(weighted.reduced_chi_squared(system.residual) / power, 1.0)
+    return _with_variances(covariance, np.max(estimates, axis=0) * scale_factor)

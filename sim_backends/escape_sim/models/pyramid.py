@@ -53,8 +53,9 @@ _SHARPER = 0.5
 #: The same of an exponential profile. At equal nodes its matrix is wrong by 0.25 %, its derivatives by 1 to
 #: 2 %; at this, by 0.007 % and 0.1 %.
 _SHARPER_PROFILE = 0.7
-#: Mirror shapes whose response is computed for each turbulence state.
-_N_SHAPES = 10
+#: Mirror shapes whose response is computed in every turbulence state. That few of them respond differently
+#: outweighs the turbulence in the scalings.
+_N_SHAPES = 60
 #: The relevant pattern of errors of the images' relative positions: opposite shifts of the diagonal pairs mix
 #: derivatives of the y slopes into the x slopes, as a registration shift does. Other patterns displace images
 #: whose sum is used or whose difference does not depend on the phase.
@@ -309,14 +310,14 @@ class PyramidModel(DesignModel):
         if self._turbulence_scatter is None:
             optics, x = self.optics(), self._pupil.coordinates_m
             screens = self._phases.phases(self.turbulence)
-            phases = np.repeat(screens[:, None], _N_SHAPES, axis=1)
-            if self._pokes:
-                phases += self._pokes.phases(screens.shape[0] * _N_SHAPES).reshape(phases.shape)
-            paths = self._surfaces(x) * (2 * self._config.devices.dm.stroke_m)
+            pokes = self._pokes.phases(_N_SHAPES) if self._pokes else np.zeros((1, *screens.shape[1:]))
+            modes = self._basis()
+            shapes = modes @ np.random.default_rng(2).standard_normal((modes.shape[1], _N_SHAPES))
+            stroke_m = 2 * self._config.devices.dm.stroke_m
+            paths = np.tensordot(shapes.T, self._surfaces(x), 1) * stroke_m
             self._turbulence_scatter = turbulence_registration_scatter(
-                optics, self._pupils, phases, self._draw_commands(len(screens)), paths,
-                lambda m2c: self.modal_jacobian(Registration(), m2c),
-            )  # fmt: skip
+                optics, self._pupils, screens, pokes, paths, *self.modal_jacobian(Registration(), shapes)
+            )
         return np.asarray(self._turbulence_scatter / np.sqrt(self._pupils.n_effective))
 
     def _basis(self) -> NDArray[np.float64]:
@@ -344,11 +345,6 @@ class PyramidModel(DesignModel):
         return PokePhase.from_rms(
             self._pupils.pokes, max_amplitude, scale * np.tensordot(m2c.T, surfaces, 1), lit
         )
-
-    def _draw_commands(self, count: int) -> NDArray[np.float64]:
-        """Commands ``(count, n_act, k)`` of all modes with random amplitudes."""
-        m2c = self._basis()
-        return m2c @ np.random.default_rng(2).standard_normal((count, m2c.shape[1], _N_SHAPES))
 
     def _compute_phase_derivatives(self) -> NDArray[np.float32]:
         """Derivatives of the slopes by the phase at the nodes ``(n_slopes, m * m)``."""

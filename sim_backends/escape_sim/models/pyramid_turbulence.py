@@ -7,7 +7,6 @@ scatter that a finite number of turbulence states leaves.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -312,16 +311,15 @@ _STEP_WAVES = 0.01
 #: Smallest ratio of the turbulence's variance to the total: few states estimate a covariance poorly.
 _MIN_SHARE = 0.1
 
-Jacobian = Callable[[NDArray[np.float64]], tuple[NDArray[np.float64], NDArray[np.float64]]]
-
 
 def turbulence_registration_scatter(
     optics: PyramidOptics,
     pupils: PyramidPupils,
-    phases: NDArray[np.float64],
-    shapes: NDArray[np.float64],
-    influence_m: NDArray[np.float64],
-    jacobian: Jacobian,
+    screens: NDArray[np.float64],
+    pokes: NDArray[np.float64],
+    paths_m: NDArray[np.float64],
+    matrix: NDArray[np.float64],
+    derivatives: NDArray[np.float64],
 ) -> NDArray[np.float64]:
     """Standard deviation ``(5,)`` over turbulence states of the best-fitting registration.
 
@@ -329,34 +327,35 @@ def turbulence_registration_scatter(
     describes the mean, so its registration errs by this scatter over the root of the number of states
     that a measurement averaged. It is computed from differences of frames with a mirror shape up and
     down. Pokes are new in every frame and average as noise, which the fit's standard errors include.
-    Therefore each state is fitted twice, under different pokes, and the covariance of the two fits is
-    that of the turbulence.
+    Shapes and pokes are the same in every state, so that their own effect is none of the scatter; each state
+    is fitted twice, with other shapes and pokes, and the covariance of both fits is that of the turbulence.
 
     Parameters
     ----------
     optics
         The nominal sensor.
-    phases
-        Random states ``(count, k, n, n)`` in radians: turbulence, with other pokes for every shape.
-    shapes
-        Commands ``(count, n_act, k)`` whose response is computed under each state, of all modes of a
-        calibration, since fine shapes constrain the registration better than coarse ones.
-    influence_m
-        Optical path per unit command of each actuator ``(n_act, n, n)`` in metres.
-    jacobian
-        The model's matrix for shapes ``(n_act, k)``, and its derivatives by registration and width.
+    screens
+        Random states of the turbulence ``(count, n, n)`` in radians.
+    pokes
+        Random pokes beside each shape ``(k, n, n)`` in radians, or ``(1, n, n)`` for all of them.
+    paths_m
+        Optical path of the shapes ``(k, n, n)`` in metres, of all modes of a calibration, since fine shapes
+        constrain the registration better than coarse ones.
+    matrix, derivatives
+        The model's response to the shapes ``(n_slopes, k)``, and its derivatives by registration and width.
     """
     fits = []
-    for states, commands in zip(phases * (optics.wavelength_m / (2 * np.pi)), shapes, strict=True):
-        paths = np.tensordot(commands.T, influence_m, 1)
-        half_step_m = _STEP_WAVES * optics.wavelength_m / float(paths.std())
+    terms = np.concatenate([matrix[None], derivatives[:5]])
+    half_step_m = _STEP_WAVES * optics.wavelength_m / float(paths_m.std())
+    pokes_m, screens_m = (phases * (optics.wavelength_m / (2 * np.pi)) for phases in (pokes, screens))
+    around = np.broadcast_to(pokes_m, paths_m.shape)
+    for screen in screens_m:
         slopes = [
-            slopes_of_image(optics.frame((state + half_step_m * path).astype(np.float32)), pupils)
-            - slopes_of_image(optics.frame((state - half_step_m * path).astype(np.float32)), pupils)
-            for state, path in zip(states, paths, strict=True)
+            slopes_of_image(optics.frame((screen + poke + half_step_m * path).astype(np.float32)), pupils)
+            - slopes_of_image(optics.frame((screen + poke - half_step_m * path).astype(np.float32)), pupils)
+            for poke, path in zip(around, paths_m, strict=True)
         ]
-        unit, derivatives = jacobian(commands)
-        terms, measured = np.concatenate([unit[None], derivatives[:5]]), np.stack(slopes, axis=1)
+        measured = np.stack(slopes, axis=1)
         fits.append([_fit_registration(terms[:, :, half::2], measured[:, half::2]) for half in range(2)])
     deviations = np.array(fits) - np.mean(fits, axis=0)
     freedom = len(deviations) - 1
