@@ -52,14 +52,14 @@ def test_motion_pokes_and_what_lasts(memory: float, white: float) -> None:
     assert np.mean([f.n_effective for f in found]) == pytest.approx(0.85 * 1500 / integral, rel=0.3)
 
 
-@pytest.mark.parametrize(("tilt_memory", "most"), [(300.0, 6.0), (3000.0, 5.0)])
+@pytest.mark.parametrize(("tilt_memory", "most"), [(50.0, 22.0), (300.0, 9.0), (3000.0, 8.0)])
 def test_tilts_that_outlast_the_other_slopes_count(tilt_memory: float, most: float) -> None:
-    # Five correlation times, or half of one: 3.1 and 1.2 independent realisations. A run of so few determines
-    # their number to no better than a factor of two; the slopes without the tilts have more than a hundred.
+    # 15, 3.1 and 1.2 independent realisations; what outlasts the run is in its mean and cannot be seen. The
+    # slopes without the tilts have more than a hundred.
     assert run(1500, 5.0, 0.5, 0).n_effective > 100
     found = [run(1500, 5.0, 0.5, seed, 0.5, tilt_memory).n_effective for seed in range(12)]
-    assert min(found) >= 1
-    assert 1 < np.median(found) < most
+    assert min(found) > 1
+    assert 3 < np.median(found) < most
 
 
 def test_pokes_without_turbulence_are_new_in_every_frame() -> None:

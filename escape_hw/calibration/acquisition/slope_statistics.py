@@ -6,18 +6,17 @@ from collections import deque
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import brentq
 
 from escape_hw.api.sensor import SensorGeometry, SubApertureGrid
 
 #: Lag of the correlation in frames: a poke is gone from the slopes, turbulence is not.
 _LAG_FRAMES = 2
-#: Blocks of a run at most whose means give the correlation time; at least half as many.
-_MAX_BLOCKS = 8
+#: Blocks of a run at most whose means give the correlation over time; at least half as many.
+_MAX_BLOCKS = 64
+#: Blocks below which the number of independent realisations is unknown.
+_MIN_BLOCKS = 4
 #: Share of the slopes' variance below which turbulence cannot be distinguished from noise.
 _MIN_TURBULENCE_FRACTION = 0.02
-#: Correlation times between which that of the turbulence is searched, relative to the run.
-_CORRELATION_TIMES = (1e-4, 1e3)
 #: Block length of the focus regression in seconds: long for vibrations and pokes, short for the wind to cross
 #: the pupil.
 _BLOCK_S = 0.05
@@ -143,61 +142,45 @@ class SlopeStatistics:
 
         The large scales of the turbulence last longest, and change the sensitivity of a pyramid most.
         """
-        n_full = self._n_frames // self._block_length
-        if n_full < _MAX_BLOCKS // 2 or not variance > 0:
+        complete = self._blocks[: self._n_frames // self._block_length]
+        if len(complete) < _MIN_BLOCKS or not variance > 0:
             return 0.0
-        blocks = np.stack(self._blocks)
-        n_effective = self._realisations(blocks, variance, persistent_fraction if poked else 1.0)
+        means = np.stack(complete) / self._block_length
+        n_effective = self._realisations(means, variance, persistent_fraction if poked else 1.0)
         tilt_variance = self._tilt_rms() ** 2
         if tilt_variance > 0:
             mean = np.square(_tilts(self._sum) / self._n_frames).mean()
             fraction = (self._tilt_lag_products / self._n_lag_pairs - mean) / tilt_variance
             fraction = float(np.clip(fraction, 0.0, 1.0)) if poked and np.isfinite(fraction) else 1.0
-            n_effective = min(n_effective, self._realisations(_tilts(blocks), tilt_variance, fraction))
+            n_effective = min(n_effective, self._realisations(_tilts(means), tilt_variance, fraction))
         return n_effective
 
-    def _realisations(
-        self, blocks: NDArray[np.float64], variance: float, turbulence_fraction: float
-    ) -> float:
-        """Independent realisations in the run, from the sums over its blocks ``(n_blocks, n)``.
+    def _realisations(self, means: NDArray[np.float64], variance: float, turbulence_fraction: float) -> float:
+        """Independent realisations in the run, from the means over its blocks ``(n_blocks, n)``.
 
-        The turbulence, ``turbulence_fraction`` of the variance, has an exponential correlation; noise and
-        pokes are new in every frame. The correlation time is that whose variances of frames and of block
-        means about the mean of the run have the measured ratio; without the mean of the run in the theory,
-        turbulence that outlasts the run would not be noticed.
+        The variance of a mean over many correlation times is that of the turbulence times the integral of
+        its correlation, over the duration. The correlations between blocks are added up to the first one
+        that is not positive (initial positive sequence, Geyer 1992). Noise and pokes, all but
+        ``turbulence_fraction`` of the variance, are new in every frame. Turbulence that outlasts the run
+        is in its mean, so that a run has at least about four realisations.
         """
         if turbulence_fraction <= _MIN_TURBULENCE_FRACTION:
             return float(self._n_frames)
-        n_frames = np.full(len(blocks), float(self._block_length))
-        n_frames[-1] = self._n_frames - n_frames[:-1].sum()
-        weights = n_frames / self._n_frames
-        deviations = blocks / n_frames[:, None] - blocks.sum(axis=0) / self._n_frames
-        between = float(weights @ np.square(deviations).mean(axis=1))
-        between -= (1 - turbulence_fraction) * variance * (len(blocks) - 1) / self._n_frames
-        ratio = between / (turbulence_fraction * variance)
-
-        def excess(correlation_time: float) -> float:
-            run = _variance_of_mean(1 / correlation_time)
-            block = sum(w * _variance_of_mean(w / correlation_time) for w in weights)
-            return float((block - run) / (1 - run)) - ratio
-
-        shortest, longest = _CORRELATION_TIMES
-        if excess(longest) <= 0:
-            return 1.0
-        if excess(shortest) >= 0:
-            return float(self._n_frames)
-        correlation_time = float(brentq(excess, shortest, longest))
-        return min(1 / _variance_of_mean(1 / correlation_time), float(self._n_frames))
+        deviations = means - means.mean(axis=0)
+        n_blocks, n = means.shape
+        covariance = np.array(
+            [np.vdot(deviations[: n_blocks - lag], deviations[lag:]) for lag in range(n_blocks)]
+        ) / (n_blocks * n)
+        covariance[0] -= (1 - turbulence_fraction) * variance / self._block_length
+        ends = np.flatnonzero(covariance[1:] <= 0)
+        total = covariance[0] + 2 * covariance[1 : 1 + int(ends[0]) if len(ends) else None].sum()
+        integral = self._block_length * total / (turbulence_fraction * variance)
+        return self._n_frames / max(float(integral), 1.0)
 
 
 def _tilts(slopes: NDArray[np.floating]) -> NDArray[np.float64]:
     """Means of the x and of the y slopes over the pupil ``(..., 2)``."""
     return np.asarray(slopes.reshape(*slopes.shape[:-1], 2, -1).mean(axis=-1, dtype=np.float64))
-
-
-def _variance_of_mean(duration: float) -> float:
-    """Variance of the mean of an exponential correlation over ``duration`` correlation times."""
-    return float(2 * (duration - 1 + np.exp(-duration)) / duration**2)
 
 
 class StaticFocusEstimator:

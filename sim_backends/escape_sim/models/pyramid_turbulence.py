@@ -308,7 +308,9 @@ def unit_screens(n: int, outer_scale: float) -> NDArray[np.float64]:
 
 #: Rms path of a mirror shape in waves, in the linear range.
 _STEP_WAVES = 0.01
-#: Smallest ratio of the turbulence's variance to the total: few states estimate a covariance poorly.
+#: Groups of shapes that are fitted by themselves.
+_N_GROUPS = 6
+#: Smallest ratio of the turbulence's variance to the total: few states estimate it poorly.
 _MIN_SHARE = 0.1
 
 
@@ -327,8 +329,9 @@ def turbulence_registration_scatter(
     describes the mean, so its registration errs by this scatter over the root of the number of states
     that a measurement averaged. It is computed from differences of frames with a mirror shape up and
     down. Pokes are new in every frame and average as noise, which the fit's standard errors include.
-    Shapes and pokes are the same in every state, so that their own effect is none of the scatter; each state
-    is fitted twice, with other shapes and pokes, and the covariance of both fits is that of the turbulence.
+    Shapes and pokes are the same in every state, so that their own effect is none of the scatter. Groups of
+    shapes, with their pokes, are fitted by themselves; what they do not have in common in one state is not
+    due to the turbulence (analysis of variance).
 
     Parameters
     ----------
@@ -356,11 +359,17 @@ def turbulence_registration_scatter(
             for poke, path in zip(around, paths_m, strict=True)
         ]
         measured = np.stack(slopes, axis=1)
-        fits.append([_fit_registration(terms[:, :, half::2], measured[:, half::2]) for half in range(2)])
+        fits.append(
+            [
+                _fit_registration(terms[:, :, g::_N_GROUPS], measured[:, g::_N_GROUPS])
+                for g in range(_N_GROUPS)
+            ]
+        )
     deviations = np.array(fits) - np.mean(fits, axis=0)
-    freedom = len(deviations) - 1
-    common_variance = np.prod(deviations, axis=1).sum(axis=0) / freedom
-    total_variance = np.square(deviations.mean(axis=1)).sum(axis=0) / freedom
+    means, freedom = deviations.mean(axis=1), len(deviations) - 1
+    total_variance = np.square(means).sum(axis=0) / freedom
+    by_groups = np.square(deviations - means[:, None]).sum(axis=(0, 1)) / (freedom * (_N_GROUPS - 1))
+    common_variance = total_variance - by_groups / _N_GROUPS
     # Turbulence and pupil have no preferred direction; averaging x and y improves the estimate.
     for variance in (common_variance, total_variance):
         variance[:2] = variance[:2].mean()
