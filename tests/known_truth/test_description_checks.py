@@ -113,6 +113,18 @@ def test_what_clocking_adds_to_the_variances_is_its_square_on_average(true_deg: 
     assert not Clocking(0.0, 0.3, np.zeros(5)).covariance.any()
 
 
+def test_a_clocking_that_may_be_chance_is_named_where_it_dominates_the_errors() -> None:
+    clocking = Clocking(0.75, 0.3, np.array([0.0, 0.0, 0.15, 0.0, 0.0]))
+    added = np.sqrt(np.diag(clocking.covariance))
+    (said,) = clocking.describe(np.hypot(added, [1.0, 1.0, 0.06, 1.0, 1.0]))
+    assert "may be turned by 0.75 ± 0.30 degrees" in said
+    assert f"{np.hypot(added[2], 0.06) / 0.06:.1f} times" in said
+    assert clocking.describe(np.hypot(added, [1.0, 1.0, 0.3, 1.0, 1.0])) == ()
+    # A significant one is named whatever it does.
+    (said,) = Clocking(1.0, 0.3, np.zeros(5)).describe(np.ones(5))
+    assert "are turned by 1.00 ± 0.30" in said
+
+
 def test_y_slopes_before_x_slopes_are_named() -> None:
     matrix = measured(0)
     x, y = np.split(matrix.data, 2)
@@ -130,4 +142,4 @@ def test_no_clocking_is_named_where_the_fit_did_not_converge() -> None:
 
 @pytest.mark.parametrize(("angle", "named"), [(0.004, False), (0.006, True), (-0.004, False)])
 def test_an_angle_that_is_printed_as_zero_is_not_named(angle: float, named: bool) -> None:
-    assert bool(Clocking(angle, 1e-4, np.zeros(5)).describe()) is named
+    assert bool(Clocking(angle, 1e-4, np.zeros(5)).describe(np.ones(5))) is named

@@ -25,6 +25,8 @@ _NAMED_SCALING, _NAMED_STRETCH = 3.0, 0.02
 #: Clocking, in its standard errors, from which on it is named; gains of x and y slopes differ from as many
 #: standard errors on.
 _SIGNIFICANT = 3.0
+#: Share of a variance of the registration from which on an insignificant clocking is named.
+_LARGE_SHARE = 0.5
 #: Smallest clocking in degrees that is named: a smaller one is printed as zero.
 _MIN_ANGLE_DEG = 0.005
 _MAX_NAMED = 8
@@ -114,14 +116,24 @@ class Clocking:
         fraction = max(1 - self.sigma_deg**2 / square, 0.0) if square else 0.0
         return np.outer(self.bias, self.bias) * fraction
 
-    def describe(self) -> tuple[str, ...]:
-        """A sentence for the operator; none where the angle may be chance or is printed as zero."""
-        if abs(self.angle_deg) < max(_SIGNIFICANT * self.sigma_deg, _MIN_ANGLE_DEG):
+    def describe(self, sigma: NDArray[np.float64]) -> tuple[str, ...]:
+        """A sentence for the operator; none where the angle may be chance and matters little.
+
+        ``sigma (5,)`` are the standard errors of the registration, the clocking's part included.
+        """
+        angle = f"{self.angle_deg:.2f} ± {self.sigma_deg:.2f} degrees against the grid of sub-apertures"
+        if abs(self.angle_deg) >= max(_SIGNIFICANT * self.sigma_deg, _MIN_ANGLE_DEG):
+            return (
+                f"the slopes are turned by {angle}: the camera is clocked against the lenslets or the "
+                "pyramid; the errors of the registration include what this does to it",
+            )
+        share = float(np.max(np.diag(self.covariance) / np.square(sigma)))
+        if share < _LARGE_SHARE:
             return ()
         return (
-            f"the slopes are turned by {self.angle_deg:.2f} ± {self.sigma_deg:.2f} degrees against the grid "
-            "of sub-apertures: the camera is clocked against the lenslets or the pyramid; the errors of the "
-            "registration include what this does to it",
+            f"the slopes may be turned by {angle}, or not; the errors of the registration are up to "
+            f"{1 / np.sqrt(1 - share):.1f} times as large for it: check the camera's clocking, or use more "
+            "frames or larger pokes",
         )
 
 

@@ -421,7 +421,7 @@ def _build_estimate(
     registration = Registration.from_array(solution.alpha)
     if not warnings:
         residual = solution.system.residual
-        notes += () if clocking is None else clocking.describe()
+        notes += () if clocking is None else clocking.describe(sigma[1:6])
         notes += tuple(describe_description(weighted, residual, registration, solution.state))
     numbering = numbering_covariance(context.model)
     return RegistrationEstimate(
