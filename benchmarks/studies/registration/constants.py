@@ -42,7 +42,6 @@ SENSOR_KEYS = {
 _SHAPE = "escape_hw.calibration.sprint.influence_shape"
 _EFFECTS = "escape_hw.calibration.sprint.mixed_effects"
 _LENSLETS, _PYRAMID = "escape_sim.models.shack_hartmann", "escape_sim.models.pyramid"
-_TURBULENCE = "escape_sim.models.pyramid_turbulence"
 #: Constants by kind of sensor: module and name.
 CONSTANTS = {
     "any": (
@@ -51,9 +50,7 @@ CONSTANTS = {
         (_EFFECTS, "_PSEUDO_COUNT"), (_EFFECTS, "_MIN_PRIOR_RATIO"),
     ),
     "shack-hartmann": ((_LENSLETS, "_TILT_VARIANCE"), (_LENSLETS, "_OUTER_SCALE")),
-    "pyramid": (
-        (_PYRAMID, "_OUTER_SCALE"), (_TURBULENCE, "_RMS_ERROR"), (_TURBULENCE, "_PERSISTENCE_ERROR"),
-    ),
+    "pyramid": ((_PYRAMID, "_OUTER_SCALE"),),
 }  # fmt: skip
 
 

@@ -20,8 +20,6 @@ from escape_sim.optics.pyramid import PyramidOptics
 
 #: Trial strengths in pupil diameters over r0; beyond the last the slopes no longer distinguish them.
 _TRIAL_STRENGTHS = 2.0 ** np.arange(-1, 5, 0.5)
-#: Errors of the slopes' rms (relative) and of the persistent fraction in a run of seconds.
-_RMS_ERROR, _PERSISTENCE_ERROR = 0.05, 0.05
 #: Pairs of phase screens per trial strength.
 _N_PAIRS = 6
 #: Side of the screens in pupils; must contain the outer scale.
@@ -276,9 +274,10 @@ def _strength_with_pokes(
     by_rms, by_share = (
         np.interp(at, np.log2(_TRIAL_STRENGTHS), values) for values in (np.log(rms), persistence)
     )
-    chi_squared = np.square((by_rms - np.log(pupils.motion)) / _RMS_ERROR)
-    chi_squared += np.square((by_share - pupils.persistent_fraction) / _PERSISTENCE_ERROR)
-    return float(2 ** at[np.argmin(chi_squared)])
+    # The relative error of the rms and the error of the fraction count alike: in both is that of the power of
+    # the same realisations of the turbulence.
+    distance = np.hypot(by_rms - np.log(pupils.motion), by_share - pupils.persistent_fraction)
+    return float(2 ** at[np.argmin(distance)])
 
 
 def _slopes(optics: PyramidOptics, pupils: PyramidPupils, phases: NDArray[np.float64]) -> NDArray[np.float64]:
