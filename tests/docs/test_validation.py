@@ -28,7 +28,7 @@ def test_the_page_is_that_of_the_raw_tables(validation):
 def test_all_tables_are_complete_and_those_of_a_kind_of_sensor_of_one_commit(validation):
     commits = {True: set(), False: set()}
     for name, rows in validation.measured_cases(FOLDER).items():
-        assert [row["realisation"] for row in rows] == list(validation.CASES[name].realisations)
+        assert [row["realisation"] for row in rows] == list(validation.REALISATIONS)
         commits[validation.CASES[name].system.endswith("shwfs")] |= {row["commit"] for row in rows}
     assert [len(found) for found in commits.values()] == [1, 1]
 
