@@ -63,16 +63,16 @@ CASES = {
     "gaussian-1000": Case("Gaussian influence functions, 1,000 frames", "razor-shwfs", 1000, GAUSSIAN),
     "gaussian-50": Case("Gaussian influence functions, 50 frames", "razor-shwfs", 50, GAUSSIAN),
     "thin-plate-1000": Case("thin plates, 1,000 frames", "razor-shwfs", 1000, _THIN_PLATE),
-    "dm97-1500": Case("mirrors like a DM97, 1,500 frames", "razor-pywfs", 1500, dm97=True, first=3000),
+    "dm97-1500": Case("mirrors like a DM97, 1,500 frames", "razor-pywfs", 1500, dm97=True, first=10_000),
     "revolt-2000": Case("as bundled, 2,000 frames", "revolt-shwfs", 2000),
-    "nir-1500": Case("as bundled, 1,500 frames", "maps-nir", 1500, first=3000),
+    "nir-1500": Case("as bundled, 1,500 frames", "maps-nir", 1500, first=10_000),
     "nir-clean-1500": Case(
         "clean and evenly lit, 1,500 frames", "maps-nir", 1500,
-        tuple(contamination_overrides(0.0)), first=3000,
+        tuple(contamination_overrides(0.0)), first=10_000,
     ),
     "nir-tenth-1500": Case(
         "a tenth of the pupil contaminated, 1,500 frames", "maps-nir", 1500,
-        tuple(contamination_overrides(0.28)), first=3000,
+        tuple(contamination_overrides(0.28)), first=10_000,
     ),
     "vis-1500": Case("as bundled, 1,500 frames", "maps-vis", 1500, first=3000),
 }  # fmt: skip
