@@ -52,6 +52,7 @@ check: $(VENV)/dev.stamp ## Check style, types and layers
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(BIN)/mypy benchmarks/studies/*/*.py
 	$(BIN)/lint-imports
 
 docs: $(VENV)/docs.stamp ## Build the documentation into docs/_build

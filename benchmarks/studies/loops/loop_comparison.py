@@ -105,7 +105,7 @@ class SeedRun:
         save_matrix(self._path(name), result, BenchRecord.from_bench(bench).origin())
 
     def _path(self, name: str) -> Path:
-        return self._folder / f"{name}.fits"
+        return Path(self._folder, f"{name}.fits")
 
     def model_psf(self) -> NDArray[np.float32]:
         """The image without turbulence."""
@@ -225,8 +225,8 @@ def closed_loop_strehl(
         found = bench.run(
             close_loop(bench, result.matrix, result.grid, gain=gain, frames=frames, model_psf=psf)
         )
-        is_valid = found.stable and found.strehl is not None
-        return {"gain": gain, "strehl": found.strehl.peak.value if is_valid else 0.0}
+        strehl = found.strehl.peak.value if found.stable and found.strehl else 0.0
+        return {"gain": gain, "strehl": strehl}
 
     what = f"{name}, {factor} of the gain, {frames} frames from {from_s} s"
     return float(100 * seed.get_or_measure(what, run)["strehl"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure, FigureBase
@@ -25,7 +26,8 @@ CURVES = {
 def draw(matrices: Mapping[str, InteractionMatrix], columns: Mapping[str, NDArray[np.float64]]) -> Figure:
     """One figure of three parts, from top to bottom."""
     figure = style.new_figure(8.2, 16.2)
-    whole, curves, maps = figure.subfigures(3, 1, height_ratios=[4.75, 1.95, 8.4])
+    parts: Any = figure.subfigures(3, 1, height_ratios=[4.75, 1.95, 8.4])
+    whole, curves, maps = parts
     draw_all_modes(whole, matrices)
     draw_correlations(curves, columns)
     draw_mode_maps(maps, matrices, N_DRAWN)

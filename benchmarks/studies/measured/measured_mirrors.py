@@ -146,7 +146,8 @@ def is_repetition(line: dict[str, Any]) -> bool:
 
 def pulls(line: dict[str, Any]) -> NDArray[np.float64]:
     """Changes since the earlier date in standard errors between runs ``(5,)``."""
-    return np.divide(line["change"], line["change_sigma"])
+    change, sigma = np.array([line["change"], line["change_sigma"]], np.float64)
+    return np.asarray(change / sigma)
 
 
 def profile(line: dict[str, Any], radius: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -174,10 +175,9 @@ def draw(lines: list[dict[str, Any]], path: Path) -> None:
     repeated = [line for line in lines if is_repetition(line)]
     for k, name in enumerate(PARAMETERS):
         values = [pulls(line)[k] for line in repeated]
-        at = np.arange(len(repeated)) + 0.12 * (k - 2)
-        changes.plot(
-            at, values, "o", ms=3.5, color=style.SERIES[k % len(style.SERIES)], label=name.replace("_", " ")
-        )
+        places = np.arange(len(repeated)) + 0.12 * (k - 2)
+        color = style.SERIES[k % len(style.SERIES)]
+        changes.plot(places, values, "o", ms=3.5, color=color, label=name.replace("_", " "))
     changes.set_yscale("symlog", linthresh=5)
     changes.axhspan(-2, 2, color=style.SERIES[1], alpha=0.2, lw=0)
     changes.set(xlabel="pair of matrices, minutes apart", ylabel="change / σ between runs")

@@ -28,6 +28,7 @@ from escape_hw.api.results import RegistrationEstimate
 from escape_hw.calibration.sprint.fit import fit_registration
 from escape_hw.calibration.sprint.tip_tilt import is_tip_tilt_removed, remove_tip_tilt
 from escape_hw.config.loader import load_system
+from escape_hw.config.sensor import PyramidSection
 from escape_hw.config.system import SystemConfig
 from escape_hw.errors import EscapeError
 from escape_hw.io.interchange.arrays import design_geometry
@@ -89,6 +90,7 @@ def twin_case() -> Case:
 def renumbered(case: Case, turn: Callable[[NDArray[Any]], NDArray[Any]]) -> InteractionMatrix:
     """The matrix with its actuators numbered on a map that is turned."""
     layout = case.overrides(()).devices.dm.actuator_map()
+    assert layout is not None, "the mirrors of this study have a map"
     number = np.full(layout.shape, -1)
     number[layout] = np.arange(int(layout.sum()))
     turned = turn(number)
@@ -132,10 +134,14 @@ def descriptions(case: Case) -> dict[str, tuple[InteractionMatrix, Sequence[str]
     """Matrix, overrides, and the change of the registration that is correct with them, by name."""
     matrix, same, config = case.matrix, np.zeros(5), case.overrides(())
     turn = np.deg2rad(1.0)
+    assert not isinstance(config.sensor, PyramidSection), "the sensors of this study have lenslets"
     across, n_sub = config.devices.dm.pitches_across_pupil, config.sensor.n_sub
     # With more lenslets across the same beam each is smaller, and the mirror covers fewer than expected.
     more = [f"sensor.n_sub={n_sub + 2}", f"sensor.pitch_px={config.sensor.pitch_px * n_sub / (n_sub + 2)}"]
-    scaled = lambda factor: np.array([0, 0, 0, 100 * (factor - 1), 100 * (factor - 1)])  # noqa: E731
+
+    def scaled(factor: float) -> NDArray[np.float64]:
+        return np.array([0, 0, 0, 100 * (factor - 1), 100 * (factor - 1)])
+
     return {
         "correct": (matrix, (), same),
         "mirrored": (renumbered(case, lambda grid: grid[:, ::-1]), (), same),

@@ -24,6 +24,7 @@ shift. A realisation takes about two minutes of a core.
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -81,13 +82,14 @@ class Measurement:
         images = [self._exposure(*pair, rest) for pair in zip(before, pokes, strict=True)]
         mean = np.mean(images[:300], axis=0)
         grid = build_sensor_setup(bench, (mean * scale).astype(np.float32)).grid
-        slopes_of = build_slope_function(bench, grid)
-        slopes = np.array([slopes_of(image * np.float32(scale)).copy() for image in images], float)
+        # The noiseless images are not the integers of a camera.
+        slopes_of: Any = build_slope_function(bench, grid)
+        slopes = np.array([slopes_of(image * np.float32(scale)).copy() for image in images], np.float64)
         slopes -= slopes.mean(axis=0)
         #: Mean share of the poke before.
         self.overlap = float(rest.mean())
-        pokes = np.asarray(pokes + self.overlap * (before - pokes), float)
-        response = np.linalg.lstsq(pokes, slopes, rcond=None)[0]
+        pokes = np.asarray(pokes + self.overlap * (before - pokes), np.float64)
+        response = np.asarray(np.linalg.lstsq(pokes, slopes, rcond=None)[0], np.float64)
         scatter = (slopes - pokes @ response).var(axis=0)
         sigma = np.sqrt(np.outer(scatter, 1 / np.square(pokes).sum(axis=0)))
         self.matrix: InteractionMatrix = build_interaction_matrix(

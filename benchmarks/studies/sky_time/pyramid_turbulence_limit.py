@@ -82,7 +82,9 @@ def run_realisation(
         (data.slopes[data.present], excitation[data.present]),
         (np.diff(data.slopes, axis=0)[pairs], np.diff(excitation, axis=0)[pairs]),
     )
-    errors = np.array([[fit_registration(terms, y[:n], x[:n]) for n in frames] for y, x in series])
+    errors = np.array(
+        [[fit_registration(terms, y[:n].astype(float), x[:n]) for n in frames] for y, x in series]
+    )
     states = np.square(model.registration_systematic_error) * np.divide(max(frames), frames)[:, None]
     return errors, states
 

@@ -45,7 +45,7 @@ def latencies(bench: Connection) -> NDArray[np.float64]:
         latency = bench.state.latency
         found.append((latency.p50, latency.p99))
         time.sleep(1.0)
-    return np.exp(np.mean(np.log(found), axis=0))
+    return np.asarray(np.exp(np.mean(np.log(found), axis=0)))
 
 
 def ratios(seen: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

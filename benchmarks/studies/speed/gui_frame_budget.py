@@ -13,6 +13,7 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+from typing import cast
 
 os.environ["QT_QPA_PLATFORM"] = "offscreen"
 sys.path.insert(0, str(Path(__file__).resolve().parents[3] / "tests"))
@@ -28,6 +29,7 @@ from escape_gui.client.session import Session
 from escape_gui.main_window import MainWindow
 from escape_gui.window.docks import WORKSPACES
 from escape_gui.window.update_timer import TICK_MS
+from escape_hw.remote.client import Connection
 
 SIZES = ((1280, 800), (2560, 1440))
 TICKS = 150
@@ -56,7 +58,7 @@ def main() -> None:
     application = qt_application()
     source, session = ScriptedSource(), Session()
     source.push_all()
-    session.set_source(source, ScriptedControl())
+    session.set_source(source, cast(Connection, ScriptedControl()))
     with tempfile.TemporaryDirectory() as folder:
         window = show_window(session, Path(folder) / "gui.json")
         # Only this script refreshes it.

@@ -19,8 +19,10 @@ import sys
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from escape_benchmarks.realisation_tables import study_parser
 from escape_hw.config.bundled import bundled_systems
@@ -60,7 +62,7 @@ def points() -> list[Point]:
     for across in LAYOUTS:
         overrides = _shack_hartmann(LENSLETS, across)
         config = load_system("razor-shwfs", overrides=overrides)
-        n_act = int(config.devices.dm.actuator_map().sum())
+        n_act = config.devices.dm.n_act
         out.append(Point("actuators", n_act, "razor-shwfs", overrides))
     if "razor-pywfs" not in bundled_systems():
         print("no system razor-pywfs here: points of the pyramid are left out", file=sys.stderr)
@@ -103,7 +105,7 @@ def _pyramid(n: int) -> tuple[str, ...]:
 
 def measure(system: str, overrides: tuple[str, ...], who: str, seconds: float) -> dict[str, float]:
     """Median time per frame, set-up time and peak memory, in this process."""
-    from escape_benchmarks.optics.frame_rate import oopao_frame, twin_frame
+    from escape_benchmarks.optics.frames import oopao_frame, twin_frame
     from escape_hw.api.concurrency import limit_to_one_thread
 
     start = time.perf_counter()
@@ -167,17 +169,19 @@ def campaign(folder: Path, minutes: float, limit: float, seconds: float) -> None
             print(point.key(who), found, flush=True)
 
 
-def read(folder: Path) -> list[dict[str, object]]:
+def read(folder: Path) -> list[dict[str, Any]]:
     return [json.loads(path.read_text()) for path in sorted(folder.glob("*.json"))]
 
 
-def slope(x: np.ndarray, y: np.ndarray) -> float:
+def slope(x: NDArray[np.float64], y: NDArray[np.float64]) -> float:
     """Exponent of the growth over the upper half of the range, where fixed costs no longer count."""
     large = x >= np.median(x)
     return float(np.polyfit(np.log(x[large]), np.log(y[large]), 1)[0]) if large.sum() > 1 else float("nan")
 
 
-def curves(rows: list[dict[str, object]], series: str, who: str, what: str) -> tuple[np.ndarray, np.ndarray]:
+def curves(
+    rows: list[dict[str, Any]], series: str, who: str, what: str
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     pairs = sorted(
         (float(r["x"]), float(r[what]))
         for r in rows
@@ -186,7 +190,7 @@ def curves(rows: list[dict[str, object]], series: str, who: str, what: str) -> t
     return np.array([p[0] for p in pairs]), np.array([p[1] for p in pairs])
 
 
-def figure(rows: list[dict[str, object]], path: Path) -> None:
+def figure(rows: list[dict[str, Any]], path: Path) -> None:
     import matplotlib.pyplot as plt
 
     names = [
@@ -221,7 +225,7 @@ def figure(rows: list[dict[str, object]], path: Path) -> None:
     plt.close(drawn)
 
 
-def table(rows: list[dict[str, object]]) -> str:
+def table(rows: list[dict[str, Any]]) -> str:
     lines = [
         "| | | ours [ms] | OOPAO [ms] | times faster | ours [MB] | OOPAO [MB] |",
         "|---|---:|---:|---:|---:|---:|---:|",
@@ -246,9 +250,9 @@ def table(rows: list[dict[str, object]]) -> str:
     fits = []
     for series in dict.fromkeys(str(r["series"]) for r in rows):
         for who in CODES:
-            x, y = curves(rows, series, who, "frame_s")
-            if x.size > 2:
-                fits.append(f"{series}, {who}: {slope(x, y):.2f}")
+            grown = curves(rows, series, who, "frame_s")
+            if grown[0].size > 2:
+                fits.append(f"{series}, {who}: {slope(*grown):.2f}")
     loads = [float(r["load"]) for r in rows if "load" in r]
     load = f" Load average {min(loads):.1f} to {max(loads):.1f}." if loads else ""
     return "\n".join(
