@@ -1,21 +1,19 @@
 """Error of the registration against the number of frames: runs the campaign and draws its curves.
 
-    python benchmarks/studies/sky_time/sky_time.py --realisations 20 --frames 20 50 220 1000 \\
-        --out docs/figures
+    python benchmarks/studies/sky_time/sky_time.py --first 10000 --realisations 10 --frames 20 50 220 1000 \\
+        --out docs/studies/sky-time
     python benchmarks/studies/sky_time/sky_time.py --realisations 5 --frames 1000 8000 --estimators unwhitened
 
-Writes ``sky-time.jsonl`` (appends one line per realisation; realisations already in the file are skipped),
-``sky-time.json`` and ``sky-time.png``, with the name of the system appended for any but ``razor-shwfs``.
-Prints rms errors with, in brackets, their ratio to the bound, normalised
-chi-squared and mean. Twenty realisations take about twenty minutes on one core (``escape reproduce sky-time``
-uses two); on a pyramid (``--system razor-pywfs``) the goal is that of its own sub-apertures, pixels of the
-pupil image.
+Writes ``SYSTEM-sky-time.jsonl`` (appends one line per realisation; realisations already in the file are
+skipped) and ``SYSTEM-sky-time.png``. Prints rms errors with, in brackets, their ratio to the bound where it
+is known, normalised chi-squared and mean. A realisation of ``razor-shwfs`` takes one to two minutes of a
+core, one of a pyramid several. The goal of a pyramid is that of its own sub-apertures, pixels of the pupil
+image.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 
 import numpy as np
 
@@ -28,6 +26,8 @@ from escape_benchmarks.realisation_tables import (
     study_parser,
     to_json,
 )
+from escape_hw.api.registration import PARAMETERS
+from escape_hw.io.provenance import get_git_state
 from escape_hw.paper.sky_time import (
     ESTIMATORS,
     FRAMES,
@@ -37,6 +37,7 @@ from escape_hw.paper.sky_time import (
     summary,
 )
 from escape_hw.report.figures.registration import error_curves
+from escape_hw.report.tables import TITLES
 
 #: What a line keeps of a realisation.
 _KEPT = ("errors", "sigmas", "exact", "hybrid")
@@ -45,17 +46,20 @@ _KEPT = ("errors", "sigmas", "exact", "hybrid")
 def measure_realisation(options: argparse.Namespace, number: int) -> Line:
     """The line of a realisation."""
     found = run_realisation(options.system, number, options.frames, estimators=options.estimators)
-    return {name: to_json(getattr(found, name)) for name in _KEPT}
+    return {"commit": get_git_state(), **{name: to_json(getattr(found, name)) for name in _KEPT}}
 
 
 def print_table(realisations: list[RealisationErrors], frames: list[int]) -> None:
     """Print a table."""
+    print(f"| frames | | {' | '.join(f'{TITLES[name][0]} [{TITLES[name][1]}]' for name in PARAMETERS)} |")
+    print("|---:|---|" + "---|" * len(PARAMETERS))
     for f, count in enumerate(frames):
         bound = np.sqrt(np.mean([p.hybrid[f] ** 2 for p in realisations], axis=0))
         for e, name in enumerate(ESTIMATORS):
             errors, sigmas = (np.stack([getattr(p, k)[e, f] for p in realisations]) for k in _KEPT[:2])
             if np.isfinite(errors).all():
-                print(f"| {count:,} | {name} | {row(errors, sigmas, bound)} |")
+                ratios = bound if np.isfinite(bound).all() else None
+                print(f"| {count:,} | {name} | {row(errors, sigmas, ratios)} |")
         if np.isfinite(bound).all():
             print(f"| | bound | {' | '.join(f'{value:.2g}' for value in bound)} |")
 
@@ -67,18 +71,21 @@ def main() -> None:
     parser.add_argument("--estimators", nargs="+", choices=ESTIMATORS, default=list(ESTIMATORS))
     options = parser.parse_args()
     options.frames.sort()
-    name = "sky-time" if options.system == "razor-shwfs" else f"sky-time-{options.system}"
-    target = options.out / f"{name}.jsonl"
+    target = options.out / f"{options.system}-sky-time.jsonl"
     asked = {"system": options.system, "frames": options.frames, "estimators": options.estimators}
     lines = each_realisation(
         target, asked, realisation_numbers(options), lambda number: measure_realisation(options, number)
     )
     realisations = [RealisationErrors(*(array(line[kept]) for kept in _KEPT)) for line in lines]
     curves = summary(realisations, options.frames, accuracy_goal(options.system))
-    (options.out / f"{name}.json").write_text(json.dumps(curves, indent=1) + "\n")
-    error_curves(curves).savefig(options.out / f"{name}.png", dpi=110, facecolor="white")
+    error_curves(curves).savefig(target.with_suffix(".png"), dpi=110, facecolor="white")
     print_table(realisations, options.frames)
-    print(f"{len(realisations)} realisations; fewest frames that meet the goal: {curves['fewest_frames']}")
+    fewest = ", ".join(
+        f"{name} {count or 'none'}"
+        for name, count in curves["fewest_frames"].items()
+        if name in options.estimators
+    )
+    print(f"\n{len(realisations)} realisations. Fewest frames that meet the goal: {fewest}.")
 
 
 if __name__ == "__main__":
