@@ -8,8 +8,6 @@ from pages import ROOT
 
 FOLDER = ROOT / "docs" / "studies" / "validation"
 SYSTEMS = {"razor-shwfs", "razor-pywfs", "revolt-shwfs", "maps-nir", "maps-vis"}
-#: Tables of mirrors of another family.
-OTHERS = sorted(FOLDER.glob("realisations-*.jsonl"))
 #: Largest error that is vouched for, in standard errors.
 MAX_PULL = 4.0
 
@@ -25,26 +23,18 @@ def test_the_page_is_that_of_the_raw_tables(validation):
     assert (FOLDER / "tables.md").read_text() == validation.page(tables)
 
 
-def test_all_tables_are_complete_and_those_of_a_system_of_one_commit(validation):
-    commits = {}
-    for name, rows in validation.measured_cases(FOLDER).items():
-        case = validation.CASES[name]
-        assert [row["realisation"] for row in rows] == list(case.realisations)
-        commits.setdefault(case.system, set()).update(row["commit"] for row in rows)
-    assert all(len(found) == 1 for found in commits.values()), commits
+def test_all_tables_are_complete_and_of_one_commit(validation):
+    commits = set()
+    for rows in validation.measured_cases(FOLDER).values():
+        assert [row["realisation"] for row in rows] == list(validation.REALISATIONS)
+        commits |= {row["commit"] for row in rows}
+    assert len(commits) == 1
 
 
 def test_none_is_vouched_for_and_wrong(validation):
     for name, rows in validation.measured_cases(FOLDER).items():
         pulls = [np.divide(row["error"], row["sigma"]) for row in rows if row["converged"]]
         assert np.abs(pulls).max() < MAX_PULL, name
-
-
-@pytest.mark.parametrize("table", OTHERS, ids=lambda path: path.stem)
-def test_those_of_mirrors_of_another_family_neither(validation, table):
-    rows = validation.read_lines(table)
-    pulls = [np.divide(row["error"], row["sigma"]) for row in rows if row["converged"]]
-    assert np.abs(pulls).max() < MAX_PULL
 
 
 def test_the_limits_that_the_page_claims(validation):

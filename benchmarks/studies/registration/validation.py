@@ -25,7 +25,7 @@ from escape_hw.api.registration import PARAMETERS
 from escape_hw.report.figures.style import SERIES, new_figure, style_axes
 
 #: Realisations of a case. No constant and no method was chosen on them.
-N_REALISATIONS = 20
+REALISATIONS = range(10000, 10020)
 #: The mirror of the bundled benches until version 0.2.0.
 GAUSSIAN = (
     "devices.dm.influence=gaussian", "devices.dm.coupling=0.4", "twin.mirror.shape=gaussian",
@@ -41,7 +41,7 @@ _THIN_PLATE = (
 class Case:
     """A system with a mirror and a number of frames.
 
-    ``title`` is its heading, and ``first`` its first realisation.
+    ``title`` is its heading.
     """
 
     title: str
@@ -49,12 +49,6 @@ class Case:
     frames: int
     overrides: tuple[str, ...] = ()
     dm97: bool = False
-    first: int = 7000
-
-    @property
-    def realisations(self) -> range:
-        """Numbers of the realisations."""
-        return range(self.first, self.first + N_REALISATIONS)
 
 
 CASES = {
@@ -63,18 +57,17 @@ CASES = {
     "gaussian-1000": Case("Gaussian influence functions, 1,000 frames", "razor-shwfs", 1000, GAUSSIAN),
     "gaussian-50": Case("Gaussian influence functions, 50 frames", "razor-shwfs", 50, GAUSSIAN),
     "thin-plate-1000": Case("thin plates, 1,000 frames", "razor-shwfs", 1000, _THIN_PLATE),
-    "dm97-1500": Case("mirrors like a DM97, 1,500 frames", "razor-pywfs", 1500, dm97=True, first=10_000),
+    "dm97-1500": Case("mirrors like a DM97, 1,500 frames", "razor-pywfs", 1500, dm97=True),
     "revolt-2000": Case("as bundled, 2,000 frames", "revolt-shwfs", 2000),
-    "nir-1500": Case("as bundled, 1,500 frames", "maps-nir", 1500, first=10_000),
+    "nir-1500": Case("as bundled, 1,500 frames", "maps-nir", 1500),
     "nir-clean-1500": Case(
-        "clean and evenly lit, 1,500 frames", "maps-nir", 1500,
-        tuple(contamination_overrides(0.0)), first=10_000,
+        "clean and evenly lit, 1,500 frames", "maps-nir", 1500, tuple(contamination_overrides(0.0))
     ),
     "nir-tenth-1500": Case(
         "a tenth of the pupil contaminated, 1,500 frames", "maps-nir", 1500,
-        tuple(contamination_overrides(0.28)), first=10_000,
+        tuple(contamination_overrides(0.28))
     ),
-    "vis-1500": Case("as bundled, 1,500 frames", "maps-vis", 1500, first=3000),
+    "vis-1500": Case("as bundled, 1,500 frames", "maps-vis", 1500),
 }  # fmt: skip
 
 #: Limits of the rms errors that the page claims: shift, rotation, scaling; and of what a matrix leaves, in %.
@@ -95,7 +88,7 @@ def measure(folder: Path, name: str) -> None:
     each_realisation(
         table_path(folder, name),
         {"system": case.system, "frames": case.frames, "set": list(case.overrides), "dm97": case.dm97},
-        case.realisations,
+        REALISATIONS,
         lambda number: run_realisation(case.system, number, case.frames, list(case.overrides), case.dm97),
         lambda row: f"{name} {np.round(row['error'], 3).tolist()}",
     )
