@@ -15,7 +15,6 @@ from escape_hw.runtime.session.system import System
 #: Scripts that only print, if their raw table has all realisations.
 SCRIPTS = (
     "capture_range", "closed_loop_response", "constants", "lenslet_pokes", "neighbouring_spots", "nuisances",
-    "registration_errors",
 )  # fmt: skip
 COMMAND = re.compile(
     rf"^python (benchmarks/studies/(?:registration|turbulence)/(?:{'|'.join(SCRIPTS)})\.py .*--out docs/.*)$",
