@@ -189,15 +189,19 @@ class BenchOwner:
         self.state.enter_fault(reason, remedy)
         log.error("FAULT: %s", reason)
         dm = self.bench.dm
-        with contextlib.suppress(EscapeError):
-            # The reason is latched already, and the mirror itself may have failed.
+        try:
+            # The mirror itself may have failed.
             if dm.is_open:
                 dm.flatten()
+        except EscapeError as error:
+            log.error("the mirror could NOT be made flat: %s", error)
         # A failed device is closed, so that it can be opened again.
         for device in self.bench.devices:
             if device.is_open and device is not dm and reason.startswith(f"{device.name}:"):
-                with contextlib.suppress(Exception):
+                try:
                     device.close()
+                except Exception as error:
+                    log.error("%s did not close cleanly: %s", device.name, error)
                 self.state.set_device_message(device.name, reason)
 
     # ------------------------------------------------------------ while a procedure or the loop runs
