@@ -42,6 +42,14 @@ def test_a_mirror_that_is_not_flat_and_a_device_that_does_not_close_are_logged(
     owner: Any, caplog: pytest.LogCaptureFixture
 ) -> None:
     with caplog.at_level(logging.ERROR):
-        owner.make_safe("wfs: gone", "Fix it.")
+        owner.make_safe("wfs: gone", "Fix it.", "wfs")
     assert "the mirror could NOT be made flat: dm: no power" in caplog.text
     assert "wfs did not close cleanly: wfs: unplugged" in caplog.text
+
+
+def test_the_failed_device_is_closed_whatever_the_reason_says(owner: Any) -> None:
+    owner.make_safe("wfs: is not the device that failed", "Fix it.")
+    assert owner.bench.wfs.closed == 0
+    owner.make_safe("the loop was opened: no frame", "Fix it.", "wfs")
+    assert owner.bench.wfs.closed == 1
+    assert owner.state.snapshot.device_messages == {"wfs": "the loop was opened: no frame"}
