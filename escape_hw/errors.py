@@ -4,9 +4,13 @@ from __future__ import annotations
 
 
 class EscapeError(Exception):
-    """Base class of all exceptions raised by ESCAPE; ``exit_code`` is that of the command line."""
+    """Base class of all exceptions raised by ESCAPE; ``exit_code`` is that of the command line.
+
+    ``device`` is the name of the device that raised it, empty for other causes.
+    """
 
     exit_code = 1
+    device = ""
 
 
 class ConfigError(EscapeError):

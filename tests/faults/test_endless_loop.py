@@ -160,6 +160,7 @@ def test_a_camera_that_stalls_opens_it(good):
     with faulty("twin.loss_probability=0", wfs={"stall_from": 100}) as bench:
         found, _, _ = kept(bench, good, end=100_000)
         assert "no frame for 5 time-outs in a row" in found.fault
+        assert found.failed_device == bench.wfs.name
         assert found.timeouts == 5
         assert found.frames < 110
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import logging
 import socket
 import threading
 import time
@@ -13,6 +15,7 @@ import pytest
 
 from escape_hw.server.engine.main import Engine
 from escape_hw.server.engine.state import EngineState, LoopParameters
+from escape_hw.server.ipc import channel as channel_module
 from escape_hw.server.ipc.channel import Channel, encode
 from escape_hw.supervision import BackgroundThread
 
@@ -61,6 +64,28 @@ def test_an_engine_that_had_no_time_to_read_does_not_take_the_front_end_for_sile
         time.sleep(0.01)
     silence.stop()
     assert "the server's front end was silent for" in reasons[0]
+
+
+def test_a_slow_reader_loses_states_but_no_replies_and_no_ends(
+    ends: tuple[Channel, socket.socket], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    channel, theirs = ends
+    monkeypatch.setattr(channel_module, "_MAX_QUEUED", 2)
+    # Nobody takes messages out of the queue any more.
+    theirs.close()
+    channel.post({"state": 0})
+    channel._sender.join(10)
+    kept: list[dict[str, Any]] = [
+        {"state": 1}, {"progress": 2}, {"reply": 3, "answer": None}, {"run": 4}, {"ended": 5},
+        {"log": {"level": "ERROR"}}, {"clean_exit": True},
+    ]  # fmt: skip
+    with caplog.at_level(logging.WARNING):
+        for message in [*kept[:2], {"state": 6}, {"progress": 7}, {"log": {"level": "INFO"}}, *kept[2:]]:
+            channel.post(message)
+    queued = [channel._queue.get_nowait() for _ in kept]
+    assert [json.loads(line or b"") for line in queued] == kept
+    assert channel._queue.empty()
+    assert [record.args for record in caplog.records] == [(1,), (2,)]
 
 
 def test_a_background_thread_that_fails_is_reported() -> None:

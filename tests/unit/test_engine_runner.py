@@ -50,7 +50,7 @@ class Owner:
         self.state_publisher = SimpleNamespace(publish=lambda: None)
         self.sent: list[Any] = []
         self.send = self.sent.append
-        self.flat = 0
+        self.flat, self.failed_device = 0, ""
 
     def stop(self) -> None:
         raise DeviceLost("wfs", "the camera has gone")
@@ -61,8 +61,9 @@ class Owner:
     def flatten(self) -> None:
         self.flat += 1
 
-    def make_safe(self, reason: str, remedy: str) -> None:
+    def make_safe(self, reason: str, remedy: str, device: str = "") -> None:
         self.state.enter_fault(reason, remedy)
+        self.failed_device = device
 
     def send_flat_replies(self) -> None:
         """No request waits."""
@@ -94,6 +95,7 @@ def test_a_loop_that_cannot_be_closed_is_reported_and_does_not_count_as_closed(o
     now = owner.state.snapshot
     assert [str(error) for error in reported] == ["wfs: the camera has gone"]
     assert now.fault is not None
+    assert owner.failed_device == "wfs"
     assert (now.loop_control, now.loop_closed, now.phase) == (None, False, Phase.FAULT)
 
 

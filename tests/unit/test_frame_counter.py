@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from itertools import pairwise
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -55,3 +56,14 @@ def test_no_frame_is_exposed_after_it_arrived_and_times_rise(offset, frames) -> 
 
 def test_without_time_stamps_the_arrival_has_to_do() -> None:
     assert CameraClock().exposed_ns(0, 77) == 77
+
+
+@pytest.mark.parametrize("drift", [-20e-6, 20e-6])
+def test_a_camera_clock_that_drifts_is_followed(drift: float) -> None:
+    clock, errors = CameraClock(), []
+    for frame in range(36_000):
+        true_ns = (frame + 1) * 10**8
+        arrived_ns = true_ns + (10**6 if frame % 2 else 3 * 10**6)
+        errors.append(clock.exposed_ns(round(true_ns * (1 + drift)), arrived_ns) - true_ns)
+    # The shortest delay is 1 ms; an hour of drift would be 72 ms.
+    assert all(abs(error - 10**6) < 2 * 10**4 for error in errors[1:])

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import fake_results as fake
 import numpy as np
@@ -13,6 +15,8 @@ from escape_hw.api.offsets import Offsets
 from escape_hw.calibration.modes.low_orders import combine_low_orders
 from escape_hw.errors import ConfigError, IncompatibleProduct, ProductError
 from escape_hw.io.fits.offsets import load_offsets, save_offsets
+from escape_hw.remote.requests import OffsetsRequest
+from escape_hw.server.engine.offsets import OffsetControl
 
 #: Wavefront of a coefficient of 1, nm rms.
 NM = 7000.0
@@ -84,3 +88,40 @@ def test_offsets_are_saved_and_restored(tmp_path: Path) -> None:
     path.write_bytes(path.read_bytes()[:-2000])
     with pytest.raises(ProductError):
         load_offsets(path)
+
+
+def load_saved(runs: Path, simulated: bool) -> tuple[OffsetControl, dict[str, float]]:
+    """Load the offsets 'x' in the engine of the system 'small'; returns its control and the terms."""
+    config = SimpleNamespace(system=SimpleNamespace(name="small"))
+    dm = SimpleNamespace(is_open=True, info=SimpleNamespace(n_act=4), set_flat=lambda flat: None)
+    state = SimpleNamespace(loop_control=None, active_run=None, fault=None)
+    owner: Any = SimpleNamespace(
+        bench=SimpleNamespace(config=config, dm=dm, simulated=simulated),
+        state=SimpleNamespace(snapshot=state, check_idle=lambda: None),
+        post=lambda job: None,
+    )
+    control = OffsetControl(owner, runs)
+    request = OffsetsRequest(verb="load_offsets", client="0" * 8, name="x")
+    control.handle(request, lambda state, error: None)
+    return control, dict(control.offsets.terms)
+
+
+def test_saved_offsets_of_another_system_or_of_a_simulation_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "offsets" / "small" / "x.fits"
+    path.parent.mkdir(parents=True)
+    save_offsets(path, Offsets({"tip": 1.0}), "small", True, fake.ORIGIN)
+    assert load_saved(tmp_path, simulated=True)[1] == {"tip": 1.0}
+    with pytest.raises(IncompatibleProduct, match="made in simulation"):
+        load_saved(tmp_path, simulated=False)
+    save_offsets(path, Offsets({"tip": 1.0}), "large", False, fake.ORIGIN)
+    with pytest.raises(IncompatibleProduct, match="its system is 'large'"):
+        load_saved(tmp_path, simulated=False)
+
+
+def test_offsets_saved_by_earlier_versions_are_found_by_their_system(tmp_path: Path) -> None:
+    folder = tmp_path / "offsets"
+    folder.mkdir()
+    save_offsets(folder / "small_x.fits", Offsets({"tip": 2.0}), "small", False, fake.ORIGIN)
+    save_offsets(folder / "small_b_x.fits", Offsets({"tip": 3.0}), "small_b", False, fake.ORIGIN)
+    control, terms = load_saved(tmp_path, simulated=False)
+    assert (control.saved, terms) == (("x",), {"tip": 2.0})

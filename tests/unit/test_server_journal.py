@@ -48,3 +48,25 @@ def test_a_damaged_list_of_products_is_told(
     assert "products are not offered again" in caplog.text
     assert journal.products == ()
     assert any("did not end cleanly" in note for note in notes)
+
+
+@pytest.mark.parametrize("damaged", [{"pid": None}, {"pid": "x"}, {"last_run_id": []}, {"run": 3}], ids=str)
+def test_a_damaged_journal_does_not_stop_the_start_of_the_server(
+    folder: Path, caplog: pytest.LogCaptureFixture, damaged: dict[str, Any]
+) -> None:
+    leave_journal(folder, **damaged)
+    with caplog.at_level(logging.WARNING):
+        assert ServerJournal("bench").read_previous_end() == ()
+    assert f"{folder / 'bench.journal.json'} is damaged: {next(iter(damaged))}" in caplog.text
+
+
+def test_a_damaged_incident_report_is_told(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
+    path = folder / "bench-12.incident.json"
+    path.write_text("{")
+    with caplog.at_level(logging.WARNING):
+        assert ServerJournal("bench").read_incident(12) is None
+        assert ServerJournal("bench").read_previous_end() == ()
+    assert caplog.text.count(f"{path} is damaged") == 2
+    caplog.clear()
+    assert ServerJournal("bench").read_incident(13) is None
+    assert not caplog.text, "most engines leave none"

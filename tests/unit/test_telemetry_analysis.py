@@ -193,6 +193,29 @@ def test_the_newest_entries_of_a_file_that_is_being_written(tmp_path: Path):
     assert read_newest(path, 10**6).index.size == 2000
 
 
+def test_a_file_that_is_no_recording_is_refused(tmp_path: Path):
+    path = tmp_path / "slopes.blocks"
+    path.write_text("no recording, but a text\n")
+    with pytest.raises(ProductError, match="not a recording"):
+        read_newest(path, 10)
+    assert count_entries(path) == 0
+    with open(path, "wb") as file:
+        np.save(file, np.zeros(4))
+        np.save(file, np.zeros((4, 2)))
+    with pytest.raises(ProductError, match="not a recording"):
+        read_newest(path, 10)
+    with pytest.raises(ProductError, match="cannot be read"):
+        read_newest(tmp_path / "none.blocks", 10)
+
+
+@pytest.mark.parametrize("size", [0, 3, 9, 100, 300])
+def test_a_recording_whose_first_block_is_being_written_has_no_entries(tmp_path: Path, size: int):
+    recorded(tmp_path / "r")
+    path = tmp_path / "r" / "slopes.blocks"
+    path.write_bytes(path.read_bytes()[:size])
+    assert read_newest(path, 10) is None
+
+
 def test_an_open_loop_recording_has_spectra_of_slopes_only(tmp_path: Path):
     folder = tmp_path / "2026-11-22" / "213000_telemetry"
     recorded(folder)

@@ -18,6 +18,7 @@ from escape_hw.api.emulator import EmulatorRequest
 from escape_hw.config.registry import emulator_factory
 from escape_hw.errors import ConfigError
 from escape_sim.emulators.asm import protocol as w
+from escape_sim.emulators.asm import server as asm_server
 from escape_sim.emulators.asm.emulator import AsmEmulator
 from escape_sim.emulators.asm.server import AsmConnection
 
@@ -322,3 +323,15 @@ def test_options_and_faults_of_version_0_1_0_are_accepted(capsys: pytest.Capture
     assert kinds == ["contaminate", "unreadable", "clear", "truncate", "stall"]
     assert "deprecated: 'hold' is now 'hold_s'; the old word will be removed" in capsys.readouterr().err
     assert made.report()["note"] == made.report()["last_event"] == ""
+
+
+def test_the_record_of_requests_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(asm_server, "MAX_CALLS", 2)
+    with emulator() as made, RawClient(port_of(made)) as client:
+        client.send(hello(1))
+        client.reply(w.WELCOME)
+        for sequence in (2, 3, 4):
+            client.send(frame(w.HEARTBEAT, sequence))
+            client.reply(w.ACK)
+        assert made.server.calls == (("HEARTBEAT", None),) * 2
+        assert made.report()["requests"] == 3

@@ -8,6 +8,7 @@ from usb_bus import UsbPipe, pulses_s
 
 from escape_hw.api.emulator import EmulatorRequest
 from escape_hw.errors import ConfigError
+from escape_sim.emulators.e727 import controller as e727
 from escape_sim.emulators.e727 import gcs as gcs_syntax
 from escape_sim.emulators.e727.controller import E727Controller
 from escape_sim.emulators.e727.emulator import make_emulator
@@ -310,3 +311,12 @@ def test_every_axis_that_is_named_answers(servo):
     names = servo.say("SAI?").split()
     assert servo.say(f"POS? {' '.join(names)}").count("=") == len(names)
     assert servo.say("ERR?") == "0\n"
+
+
+def test_the_record_of_commands_is_bounded(monkeypatch):
+    monkeypatch.setattr(e727, "MAX_COMMANDS", 2)
+    client = Client()
+    for text in ("SVO?", "VER?", "CSV?"):
+        client.say(text)
+    assert client.controller.received_commands == ("VER?", "CSV?")
+    assert client.controller.report()["commands"] == 3

@@ -10,6 +10,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable
+from datetime import datetime
 from functools import partial
 from pathlib import Path
 
@@ -17,7 +18,8 @@ from asm_bench import emulator, port_of, wait_for
 
 from escape_hw.api.adaptive_secondary import ShellState
 from escape_hw.config.loader import load_system
-from escape_hw.server.safety.failsafe import FailsafeSettings, IncidentReport
+from escape_hw.io.provenance import format_utc
+from escape_hw.server.safety.failsafe import FailsafeSettings, IncidentReport, make_safe
 from escape_hw.supervision import process_start
 
 #: An engine as the fail-safe process sees it: it holds the mirror and the pipe, and commands a shape.
@@ -118,3 +120,12 @@ def test_a_shell_rested_by_its_watchdog_is_not_lifted(tmp_path: Path) -> None:
 def test_after_a_clean_exit_it_does_nothing(tmp_path: Path) -> None:
     with emulator(hold=60, rest=120) as made:
         assert guarded(tmp_path, port_of(made), "clean exit") is None
+
+
+def test_the_time_of_an_incident_is_written_as_all_others(tmp_path: Path) -> None:
+    twin = load_system("razor-shwfs").to_toml()
+    ended = subprocess.Popen([sys.executable, "-c", ""])
+    ended.wait()
+    settings = FailsafeSettings(config_text=twin, incidents=str(tmp_path), pid=ended.pid, started=0)
+    at_utc = make_safe(settings).at_utc
+    assert at_utc == format_utc(datetime.fromisoformat(f"{at_utc}+00:00"))

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import cmath
 import math
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,7 +13,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from escape_drivers.pi import wave_table as pi_circle
+from escape_drivers.pi.circle import CircleGenerator
 from escape_drivers.pi.wave_table import CycleTiming
+from escape_hw.api.modulator import Modulation
+from escape_hw.errors import SettingRejected
 
 SERVO_S = 50e-6
 
@@ -36,6 +41,16 @@ def test_a_possible_frequency_is_its_own_nearest(frequency):
         abs(made / frequency - 1) <= 0.51 * (1 if turn.points <= pi_circle.MAX_POINTWISE else 4) / turn.points
     )
     assert turn.points <= pi_circle.MAX_POINTWISE or turn.points % 4 == 0
+
+
+@pytest.mark.parametrize("frequency_hz", [1100.0, 2 / SERVO_S + 1, 5e4, 1e9])
+def test_a_frequency_that_is_too_high_is_refused(frequency_hz: float) -> None:
+    stage: Any = SimpleNamespace(min_points=20, max_points=4096)
+    travel: Any = SimpleNamespace(servo_s=SERVO_S)
+    nothing: Any = None
+    circle = CircleGenerator("stage", nothing, stage, travel, {}, nothing)
+    with pytest.raises(SettingRejected, match=r"it does up to 1000 Hz"):
+        circle.achievable(Modulation(1e-4, frequency_hz))
 
 
 def response(draw_x: float, draw_y: float, lag_x: float, lag_y: float) -> tuple[complex, complex]:

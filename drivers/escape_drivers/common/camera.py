@@ -58,21 +58,26 @@ class FrameCounter:
 class CameraClock:
     """Puts a camera's own time stamps on this computer's monotonic clock.
 
-    The spacing is that of the camera's exposure times. The offset is that of the frame with the shortest
-    delay since ``start``, so that no exposure time is later than the arrival.
+    The offset is that of the frame with the shortest recent delay: it grows by 100 ppm of the time, more
+    than two quartz clocks differ, and no exposure time is later than the arrival. The spacing is that of
+    the camera's exposure times to the same accuracy.
     """
+
+    _GROWTH_PPM = 100
 
     def __init__(self) -> None:
         self._offset: int | None = None
+        self._arrived_ns = 0
 
     def exposed_ns(self, stamp_ns: int, arrived_ns: int) -> int:
         """When a frame was exposed, from the camera's time stamp (0: it gives none) and the arrival."""
         if stamp_ns == 0:
             return arrived_ns
         offset = arrived_ns - stamp_ns
-        if self._offset is None or offset < self._offset:
-            self._offset = offset
-        return stamp_ns + self._offset
+        if self._offset is not None:
+            offset = min(offset, self._offset + (arrived_ns - self._arrived_ns) * self._GROWTH_PPM // 10**6)
+        self._offset, self._arrived_ns = offset, arrived_ns
+        return stamp_ns + offset
 
 
 log = logging.getLogger(__name__)

@@ -47,7 +47,7 @@ def nearest_timing(frequency_hz: float, servo_s: float, max_points: int) -> Cycl
     least = max(1, math.ceil(round(wanted) / max_points))
     candidates = []
     for rate in range(max(1, least - 1), least + 2):
-        exact = round(wanted / rate)
+        exact = max(1, round(wanted / rate))
         points = exact if exact <= MAX_POINTWISE else min(4 * round(wanted / rate / 4), max_points // 4 * 4)
         if 1 <= points <= max_points:
             candidates.append(CycleTiming(points, rate))

@@ -72,7 +72,8 @@ class RunningStrehl:
 class LoopSummary:
     """Summary of a loop that ran until it was opened.
 
-    ``fault``: why the loop was opened without a request; empty after a request.
+    ``fault``: why the loop was opened without a request; empty after a request. ``failed_device``: name of
+    the device that was the cause, if one was.
     """
 
     fault: str
@@ -81,6 +82,7 @@ class LoopSummary:
     lost_frames: int
     timeouts: int
     timing: TimingSummary
+    failed_device: str = ""
 
 
 def run_until_opened(
@@ -147,6 +149,7 @@ class _ContinuousLoop:
         self.fade_frames_left = 0
         self.fade_step = np.zeros(len(first.undriven))
         self.timeouts = self.consecutive_timeouts = 0
+        self.failed_device = ""
         self.metrics: dict[str, float] = {}
         self.metrics_at = self.histogram_at = -math.inf
         self.clipped, self.frames_counted = bench.dm.clipped_count, 0
@@ -171,7 +174,10 @@ class _ContinuousLoop:
         if fault:
             log.error("the loop was opened: %s", fault)
         timing = loop.timing.since_start()
-        return LoopSummary(fault, self.settings, loop.record.frames, loop.lost_frames, self.timeouts, timing)
+        return LoopSummary(
+            fault, self.settings, loop.record.frames, loop.lost_frames, self.timeouts, timing,
+            self.failed_device,
+        )  # fmt: skip
 
     def _log_priority(self, refusals: tuple[str, ...]) -> None:
         if refusals:
@@ -192,6 +198,7 @@ class _ContinuousLoop:
             self.consecutive_timeouts = 1 if loop.record.frames > before else self.consecutive_timeouts + 1
             yield self._complete_progress(report.now({}))
             if self.consecutive_timeouts >= _MAX_TIMEOUTS:
+                self.failed_device = error.device
                 return f"no frame for {_MAX_TIMEOUTS} time-outs in a row ({error})"
         except CommandRejected as error:
             return f"a command was rejected: {error}"

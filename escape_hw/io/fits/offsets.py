@@ -9,6 +9,7 @@ from typing import Any
 from astropy.io import fits as astropy_fits
 
 from escape_hw.api.offsets import Offsets
+from escape_hw.errors import IncompatibleProduct
 from escape_hw.io import documents
 from escape_hw.io.fits import file as fits_file
 from escape_hw.io.fits.file import Product
@@ -32,15 +33,32 @@ class OffsetsProduct(Product[Offsets]):
     """Offsets read from disk."""
 
 
-def load_offsets(path: Path | str) -> OffsetsProduct:
+def load_offsets(
+    path: Path | str, expect_system: str | None = None, allow_simulated: bool = True
+) -> OffsetsProduct:
     """Read offsets that :func:`save_offsets` wrote.
+
+    Parameters
+    ----------
+    expect_system
+        Name of the system they must belong to.
+    allow_simulated
+        False on hardware: simulated offsets are refused.
 
     Raises
     ------
     ProductError
         Not there, truncated, damaged, of another kind, incomplete or from a newer version.
+    IncompatibleProduct
+        Sound, but of another system, or simulated.
     """
-    return OffsetsProduct.read(path, KIND_OFFSETS, _unpack)
+    product = OffsetsProduct.read(path, KIND_OFFSETS, _unpack)
+    system, simulated = product.header.get("SYSTEM"), product.header.get("SIMULATE", True)
+    if expect_system is not None and system != fits_file.header_text(expect_system):
+        raise IncompatibleProduct(f"{path}: its system is {system!r}; {expect_system!r} is needed")
+    if simulated and not allow_simulated:
+        raise IncompatibleProduct(f"{path}: made in simulation; it is not for hardware")
+    return product
 
 
 def _unpack(path: Path, hdus: astropy_fits.HDUList, header: dict[str, Any]) -> Offsets:

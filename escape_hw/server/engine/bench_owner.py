@@ -104,7 +104,7 @@ class BenchOwner:
             return
         except DeviceError as error:
             if self.state.snapshot.fault is None:
-                self.make_safe(str(error), REOPEN_REMEDY)
+                self.make_safe(str(error), REOPEN_REMEDY, error.device)
             return
         grid = self.publisher.grid
         if grid is not None:
@@ -127,7 +127,7 @@ class BenchOwner:
             bench.callbacks = self.publisher.callbacks
             bench.dm.flatten()
         except EscapeError as error:
-            self.make_safe(str(error), REOPEN_REMEDY)
+            self.make_safe(str(error), REOPEN_REMEDY, error.device)
             return
         self.state.set_phase(Phase.IDLE)
         log.info("%s: %d devices open, mirror flat", bench.config.system.name, len(bench.devices))
@@ -170,7 +170,9 @@ class BenchOwner:
                 self.bench.dm.flatten()
             except DeviceError as error:
                 self.make_safe(
-                    str(error), "The mirror cannot be flattened from here. Switch its power off if needed."
+                    str(error),
+                    "The mirror cannot be flattened from here. Switch its power off if needed.",
+                    error.device,
                 )
         self.send_flat_replies()
 
@@ -184,21 +186,25 @@ class BenchOwner:
         for reply in waiting:
             reply({"fault": None if fault is None else fault.reason})
 
-    def make_safe(self, reason: str, remedy: str) -> None:
-        """Latch a fault, flatten the mirror as far as possible, and close the device that failed."""
+    def make_safe(self, reason: str, remedy: str, device: str = "") -> None:
+        """Latch a fault, flatten the mirror as far as possible, and close ``device``, which failed."""
         self.state.enter_fault(reason, remedy)
         log.error("FAULT: %s", reason)
         dm = self.bench.dm
-        with contextlib.suppress(EscapeError):
-            # The reason is latched already, and the mirror itself may have failed.
+        try:
+            # The mirror itself may have failed.
             if dm.is_open:
                 dm.flatten()
+        except EscapeError as error:
+            log.error("the mirror could NOT be made flat: %s", error)
         # A failed device is closed, so that it can be opened again.
-        for device in self.bench.devices:
-            if device.is_open and device is not dm and reason.startswith(f"{device.name}:"):
-                with contextlib.suppress(Exception):
-                    device.close()
-                self.state.set_device_message(device.name, reason)
+        for failed in self.bench.devices:
+            if failed.is_open and failed is not dm and failed.name == device:
+                try:
+                    failed.close()
+                except Exception as error:
+                    log.error("%s did not close cleanly: %s", device, error)
+                self.state.set_device_message(device, reason)
 
     # ------------------------------------------------------------ while a procedure or the loop runs
     def observe(self, progress: Progress) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import re
 import threading
@@ -17,7 +16,7 @@ from numpy.typing import NDArray
 from escape_hw.api.offsets import Offsets
 from escape_hw.calibration.modes.bases import build_modal_basis
 from escape_hw.calibration.modes.low_orders import combine_low_orders
-from escape_hw.errors import CommandRejected, EscapeError, IncompatibleProduct, RequestRefused
+from escape_hw.errors import CommandRejected, EscapeError, IncompatibleProduct, ProductError, RequestRefused
 from escape_hw.io.fits.offsets import load_offsets, save_offsets
 from escape_hw.remote.requests import OffsetsRequest
 from escape_hw.remote.state import OffsetsState
@@ -39,7 +38,7 @@ class OffsetControl:
 
     def __init__(self, owner: BenchOwner, runs: Path) -> None:
         self._owner, self._bench = owner, owner.bench
-        self._folder = runs / "offsets"
+        self._folder = runs / "offsets" / owner.bench.config.system.name
         self._m2c: NDArray[np.float64] | None = None
         self.offsets = Offsets()
         self.saved: tuple[str, ...] = ()
@@ -64,7 +63,7 @@ class OffsetControl:
             return
         self._require_possible()
         if request.verb == "load_offsets":
-            self._apply(load_offsets(self._path(request.name)).result, reply)
+            self._apply(self._load(request.name), reply)
             return
         new = self.offsets
         if request.terms is not None:
@@ -190,13 +189,36 @@ class OffsetControl:
         log.info("offsets saved as '%s'", name)
         self._list_saved()
 
+    def _load(self, name: str) -> Offsets:
+        path = self._path(name)
+        product = load_offsets(
+            self._find_saved().get(path.stem, path),
+            expect_system=self._folder.name,
+            allow_simulated=self._bench.simulated,
+        )
+        return product.result
+
     def _path(self, name: str) -> Path:
-        file = re.sub(r"[^\w.+-]", "-", name)
-        return self._folder / f"{self._bench.config.system.name}_{file}.fits"
+        return self._folder / (re.sub(r"[^\w.+-]", "-", name) + ".fits")
 
     def _list_saved(self) -> None:
-        prefix = f"{self._bench.config.system.name}_"
-        found: list[str] = []
-        with contextlib.suppress(OSError):
-            found = sorted(path.stem.removeprefix(prefix) for path in self._folder.glob(f"{prefix}*.fits"))
-        self.saved = tuple(found)
+        try:
+            self.saved = tuple(sorted(self._find_saved()))
+        except OSError as error:
+            log.warning("saved offsets cannot be listed: %s", error)
+
+    def _find_saved(self) -> dict[str, Path]:
+        """Saved files by name; those of earlier versions are ``SYSTEM_NAME.fits`` in the parent folder."""
+        prefix = f"{self._folder.name}_"
+        earlier = self._folder.parent.glob(f"{prefix}*.fits")
+        found = {path.stem.removeprefix(prefix): path for path in earlier if self._is_of_this_system(path)}
+        return found | {path.stem: path for path in self._folder.glob("*.fits")}
+
+    def _is_of_this_system(self, path: Path) -> bool:
+        try:
+            load_offsets(path, expect_system=self._folder.name)
+        except IncompatibleProduct:
+            return False
+        except ProductError as error:
+            log.warning("saved offsets: %s", error)
+        return True

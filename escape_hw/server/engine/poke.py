@@ -110,7 +110,7 @@ class PokeRunner:
                 owner.read_idle_frame()
         except EscapeError as error:
             failure = error
-            owner.make_safe(str(error), REOPEN_REMEDY)
+            owner.make_safe(str(error), REOPEN_REMEDY, error.device)
             on_begun(error)
         finally:
             owner.flatten()

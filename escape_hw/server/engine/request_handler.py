@@ -149,7 +149,7 @@ class RequestHandler:
                 answer = self._cameras.change(request).model_dump(mode="json")
             except EscapeError as error:
                 if isinstance(error, DeviceError) and not isinstance(error, SettingRejected):
-                    self._owner.make_safe(str(error), REOPEN_REMEDY)
+                    self._owner.make_safe(str(error), REOPEN_REMEDY, error.device)
                 self._reply(number, error=error)
                 return
             self._owner.state_publisher.publish()

@@ -133,12 +133,12 @@ class LoopRunner:
                 # The parameters that led to the fault are not the default of the next loop.
                 matrix = state.snapshot.loop.matrix
                 state.set_loop_settings(LoopParameters.from_config(self._owner.config, matrix))
-                self._owner.make_safe(f"the loop was opened: {end.fault}", _REMEDY)
+                self._owner.make_safe(f"the loop was opened: {end.fault}", _REMEDY, end.failed_device)
         except Aborted:
             log.info("loop open, mirror flat")
         except EscapeError as error:
             was_closed = state.snapshot.loop_closed
-            self._owner.make_safe(str(error), _REMEDY)
+            self._owner.make_safe(str(error), _REMEDY, error.device)
             if not was_closed:
                 on_closed(error)
         finally:
@@ -215,7 +215,7 @@ class ProcedureRunner:
             if not isinstance(error, EscapeError):
                 self._owner.report_defect(error)
             elif isinstance(error, DeviceError) and not isinstance(error, SettingRejected | CommandRejected):
-                self._owner.make_safe(str(error), _REMEDY)
+                self._owner.make_safe(str(error), _REMEDY, error.device)
             place = "" if folder is None else str(folder.path)
             return FinishedRun(id=run.id, name=run.name, finish=finish, message=str(error), folder=place)
         message = "" if saved.met else "it did not meet its own criteria"

@@ -9,6 +9,7 @@ Front end to engine: the settings, then ``{"heartbeat": true}``, ``{"id": N, "re
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
 import logging
 import queue
@@ -26,7 +27,7 @@ from escape_hw.supervision import BackgroundThread
 
 log = logging.getLogger(__name__)
 
-#: Messages that may wait for a slow reader; further ones are dropped.
+#: Messages that may wait for a slow reader; further states, progress and log lines of level INFO are dropped.
 _MAX_QUEUED = 1000
 #: Longest message.
 _MAX_LINE_BYTES = 16 << 20
@@ -70,20 +71,32 @@ class MessageDecoder:
             yield json.loads(line)
 
 
+def _is_droppable(message: Mapping[str, Any]) -> bool:
+    match message:
+        case {"state": _} | {"progress": _} | {"log": {"level": "INFO"}}:
+            return True
+    return False
+
+
 class Channel:
     """The engine's end of the connection. A thread sends the messages, so that no caller waits."""
 
     def __init__(self, connection: socket.socket) -> None:
         self._connection = connection
-        self._queue: queue.Queue[bytes | None] = queue.Queue(_MAX_QUEUED)
+        self._queue: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
+        self._dropped = itertools.count(1)
         self._last_message_s = time.monotonic()
         self._sender = BackgroundThread("sender", self._send)
         self._sender.start()
 
     def post(self, message: Mapping[str, Any]) -> None:
-        """Queue a message; it is dropped when the front end reads too slowly."""
-        with contextlib.suppress(queue.Full):
-            self._queue.put_nowait(encode(message))
+        """Queue a message; a state, progress or log line is dropped when the front end reads too slowly."""
+        if self._queue.qsize() < _MAX_QUEUED or not _is_droppable(message):
+            self._queue.put(encode(message))
+            return
+        dropped = next(self._dropped)
+        if dropped & (dropped - 1) == 0:  # log the 1st, 2nd, 4th, 8th ... only
+            log.warning("the front end reads too slowly; %d messages were dropped so far", dropped)
 
     def messages(self) -> Iterator[dict[str, Any]]:
         """Yield the messages that arrive, until the other side closes the connection."""
@@ -114,8 +127,7 @@ class Channel:
 
     def close(self) -> None:
         """Send the queued messages and close the connection."""
-        with contextlib.suppress(queue.Full):
-            self._queue.put(None, timeout=1)
+        self._queue.put(None)
         self._sender.stop(timeout_s=2)
         with contextlib.suppress(OSError):
             # A thread that waits in recv is not woken by close() alone.

@@ -9,7 +9,6 @@ import os
 import signal
 import sys
 import time
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -70,6 +69,7 @@ def wait_for_end(descriptor: int) -> bool:
 def make_safe(settings: FailsafeSettings) -> IncidentReport:
     """Flatten the mirror of a dead engine and remove its shared memory."""
     from escape_hw.config.loader import load_text
+    from escape_hw.io.provenance import format_utc
     from escape_hw.streams.segments import remove_orphaned
 
     began = time.monotonic()
@@ -80,7 +80,7 @@ def make_safe(settings: FailsafeSettings) -> IncidentReport:
     flat, outcome = _flatten(config)
     removed = tuple(one.name for one in remove_orphaned(settings.pid))
     return IncidentReport(
-        at_utc=datetime.now(UTC).isoformat(timespec="seconds"), system=config.system.name, pid=settings.pid,
+        at_utc=format_utc(), system=config.system.name, pid=settings.pid,
         mirror=outcome, flat=flat, seconds=time.monotonic() - began, segments=removed,
     )  # fmt: skip
 

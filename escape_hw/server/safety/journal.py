@@ -2,24 +2,25 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import logging
 import os
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 
 from escape_hw.io.fits.run_state import STATE_FILE
 from escape_hw.io.run_folder import RESULT_FILE, default_runs_folder
 from escape_hw.io.storage import write_atomic
+from escape_hw.remote.requests import first_error
 from escape_hw.remote.state import ProductEntry
 from escape_hw.server.safety.failsafe import IncidentReport
 from escape_hw.streams.segments import remove_orphaned
 from escape_hw.supervision import is_alive, process_start
 
 log = logging.getLogger(__name__)
+M = TypeVar("M", bound=BaseModel)
 #: What an engine does not know of the one before.
 RESET = (
     "gain, leak and camera settings are those of the system file again, offsets are zero, and a measured "
@@ -30,6 +31,16 @@ RESET = (
 def server_folder() -> Path:
     """Folder of the servers' logs, journals and incident reports."""
     return default_runs_folder().parent / "server"
+
+
+class _JournalContent(BaseModel):
+    """What a journal holds; the products are validated apart, since the rest is needed without them."""
+
+    pid: int = 0
+    started: int | None = None
+    run: dict[str, Any] | None = None
+    last_run_id: int = 0
+    products: Any = ()
 
 
 class ServerJournal:
@@ -82,17 +93,16 @@ class ServerJournal:
         """
         notes = []
         if (stale := self._stale_journal()) is not None:
-            self.last_run_id = int(stale.get("last_run_id", 0))
+            self.last_run_id = stale.last_run_id
             try:
-                self.products = tuple(ProductEntry.model_validate(one) for one in stale.get("products", ()))
+                self.products = tuple(ProductEntry.model_validate(one) for one in stale.products)
             except (TypeError, ValidationError) as error:
                 log.warning("the journal is damaged, products are not offered again: %s", error)
-            notes.append(f"the previous server (process {stale.get('pid')}) did not end cleanly; {RESET}")
-            if (run := stale.get("run")) is not None:
-                notes.append(_describe_run(run))
+            notes.append(f"the previous server (process {stale.pid}) did not end cleanly; {RESET}")
+            if stale.run is not None:
+                notes.append(_describe_run(stale.run))
         for path in sorted(self.folder.glob(f"{self.system}-*.incident.json")):
-            with contextlib.suppress(OSError, ValidationError):
-                report = _take_report(path)
+            if (report := _take_report(path)) is not None:
                 notes.append(f"its engine (process {report.pid}) died at {report.at_utc}: {report.mirror}")
         if removed := remove_orphaned():
             notes.append(f"{len(removed)} segments of shared memory of dead processes were removed")
@@ -102,25 +112,34 @@ class ServerJournal:
 
     def read_incident(self, pid: int) -> IncidentReport | None:
         """Report of an engine's fail-safe process; ``None`` when it left none."""
-        try:
-            return _take_report(self.folder / f"{self.system}-{pid}.incident.json")
-        except (OSError, ValidationError):
-            return None
+        return _take_report(self.folder / f"{self.system}-{pid}.incident.json")
 
-    def _stale_journal(self) -> dict[str, Any] | None:
-        try:
-            stale = json.loads(self._path.read_bytes())
-        except (OSError, ValueError):
-            return None
-        if not isinstance(stale, dict) or is_alive(int(stale.get("pid", 0)), stale.get("started")):
-            return None
-        return stale
+    def _stale_journal(self) -> _JournalContent | None:
+        stale = _read(self._path, _JournalContent)
+        return None if stale is None or is_alive(stale.pid, stale.started) else stale
 
 
-def _take_report(path: Path) -> IncidentReport:
+def _read(path: Path, model: type[M]) -> M | None:
+    """Read a document; ``None`` when it does not exist, and with a warning when it is damaged."""
+    try:
+        return model.model_validate_json(path.read_bytes())
+    except FileNotFoundError:
+        return None
+    except ValidationError as error:
+        log.warning("%s is damaged: %s", path, first_error(error))
+    except OSError as error:
+        log.warning("%s cannot be read: %s", path, error.strerror or error)
+    return None
+
+
+def _take_report(path: Path) -> IncidentReport | None:
     """Read a report and mark it as reported."""
-    report = IncidentReport.model_validate_json(path.read_bytes())
-    path.replace(path.with_suffix(".reported"))
+    report = _read(path, IncidentReport)
+    if report is not None:
+        try:
+            path.replace(path.with_suffix(".reported"))
+        except OSError as error:
+            log.warning("%s is reported again at the next start: %s", path, error.strerror or error)
     return report
 
 

@@ -6,7 +6,6 @@ one of the data, both in NumPy's file format. A truncated file is readable up to
 
 from __future__ import annotations
 
-import contextlib
 import io
 import os
 from dataclasses import dataclass
@@ -107,7 +106,10 @@ def read_recording(path: Path) -> list[Recording]:
 
 def count_entries(path: Path) -> int:
     """Number of entries in the complete blocks of a recorded stream; 0 if it cannot be read."""
-    return sum(n for _, n in _scan_blocks(path))
+    try:
+        return sum(n for _, n in _scan_blocks(path))
+    except (OSError, ProductError):
+        return 0
 
 
 def read_newest(path: Path, count: int) -> Recording | None:
@@ -120,13 +122,13 @@ def read_newest(path: Path, count: int) -> Recording | None:
     ProductError
         The file does not exist or is not a recording.
     """
-    blocks = _scan_blocks(path)
-    first, entries = len(blocks), 0
-    while first and entries < count:
-        first -= 1
-        entries += blocks[first][1]
     read = []
     try:
+        blocks = _scan_blocks(path)
+        first, entries = len(blocks), 0
+        while first and entries < count:
+            first -= 1
+            entries += blocks[first][1]
         with open(path, "rb") as file:
             for offset, _ in blocks[first:]:
                 file.seek(offset)
@@ -144,21 +146,33 @@ def read_newest(path: Path, count: int) -> Recording | None:
 
 
 def _scan_blocks(path: Path) -> list[tuple[int, int]]:
-    """Offset and number of entries of every complete block."""
-    found = []
-    with contextlib.suppress(OSError, ValueError, EOFError), open(path, "rb") as file:
+    """Offset and number of entries of every complete block (OSError; ProductError: no recording)."""
+    found: list[tuple[int, int]] = []
+    with open(path, "rb") as file:
         size = os.fstat(file.fileno()).st_size
         while (offset := file.tell()) < size:
-            entries = 0
-            for _ in range(2):
-                np.lib.format.read_magic(file)
-                shape, _, dtype = np.lib.format.read_array_header_1_0(file)
-                file.seek(dtype.itemsize * int(np.prod(shape)), os.SEEK_CUR)
-                entries = shape[0]
+            try:
+                head, head_type = _skip_array(file)
+                data, _ = _skip_array(file)
+            except ValueError as error:
+                # A block that is being written ends with the file.
+                if not found and file.tell() < size:
+                    raise ProductError(f"{path}: not a recording of ESCAPE ({error})") from error
+                break
+            if head_type != HEADER or len(head) != 1 or head != data[:1]:
+                raise ProductError(f"{path}: not a recording of ESCAPE, or damaged at byte {offset}")
             if file.tell() > size:
                 break
-            found.append((offset, entries))
+            found.append((offset, head[0]))
     return found
+
+
+def _skip_array(file: IO[bytes]) -> tuple[tuple[int, ...], np.dtype[Any]]:
+    """Shape and type of the array at the file's position, which moves to its end (ValueError: no array)."""
+    np.lib.format.read_magic(file)
+    shape, _, dtype = np.lib.format.read_array_header_1_0(file)
+    file.seek(dtype.itemsize * int(np.prod(shape)), os.SEEK_CUR)
+    return shape, dtype
 
 
 def _group_by_shape(

@@ -148,7 +148,7 @@ class AsmEmulator(Emulator):
             "note": controller.last_event,  # name of version 0.1.0
             "applied": controller.applied,
             "skipped": controller.skipped,
-            "requests": len(server.calls),
+            "requests": server.requests,
             "damaged_frames": server.damaged,
         }
 

@@ -7,6 +7,7 @@ import secrets
 import socket
 import struct
 import time
+from collections import deque
 from dataclasses import dataclass
 from typing import cast
 
@@ -21,6 +22,8 @@ from escape_sim.emulators.options import current_word
 
 #: Period of the mirror's own checks in seconds.
 TICK_S = 0.02
+#: Newest requests that are kept.
+MAX_CALLS = 20_000
 #: Roles of a client, and mode of a command in absolute positions.
 _CONTROL, _TELEMETRY, _ABSOLUTE = 0, 1, 0
 #: Kinds of fault, and whether they take a value.
@@ -212,8 +215,6 @@ class AsmServer:
 
     Attributes
     ----------
-    calls
-        Every request of owners in order, as (name, arguments).
     violations
         Violations of the protocol by clients.
     requests, damaged
@@ -227,7 +228,7 @@ class AsmServer:
     ) -> None:
         self.controller, self.versions = controller, versions
         self.replies = ReplyWriter(controller, serial)
-        self.calls: list[tuple[str, object]] = []
+        self._calls: deque[tuple[str, object]] = deque(maxlen=MAX_CALLS)
         self.violations: list[str] = []
         self.damaged = self.requests = self.token = self.counter = 0
         self.owner: AsmConnection | None = None
@@ -235,6 +236,11 @@ class AsmServer:
         self._faults = faults
         self._server: asyncio.Server | None = None
         self._tick_task: asyncio.Task[None] | None = None
+
+    @property
+    def calls(self) -> tuple[tuple[str, object], ...]:
+        """The newest requests of owners in order, as (name, arguments)."""
+        return tuple(self._calls)
 
     # ------------------------------------------------------------------ listening
     async def listen(self, host: str, port: int) -> int:
@@ -418,7 +424,7 @@ class AsmServer:
         return protocol.ACK, self.replies.ack(request.sequence, result, clipped, received_ns)
 
     def _log_call(self, request: protocol.AsmRequest, arguments: object) -> None:
-        self.calls.append((request.name, arguments))
+        self._calls.append((request.name, arguments))
 
     def _refuse(
         self, connection: AsmConnection, request: protocol.AsmRequest, code: int, message: str

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -30,6 +31,8 @@ IDENTITY = "(c)2015-2018 Physik Instrumente (PI) GmbH & Co. KG, E-727.3SDA, {ser
 Handler = Callable[[Sequence[str]], str | None]
 #: Points of a modulation cycle for the optics.
 _SAMPLES = 256
+#: Newest commands that are kept.
+MAX_COMMANDS = 20_000
 #: Cycle with its cause: generators running, and trajectories of the axes.
 _CycleCache = tuple[int, list[Trajectory], tuple[float, NDArray[np.float64]] | None]
 
@@ -37,7 +40,7 @@ _CycleCache = tuple[int, list[Trajectory], tuple[float, NDArray[np.float64]] | N
 class E727Controller:
     """A controller with a tip-tilt stage on its first two channels and nothing on the third.
 
-    ``clock`` gives monotonic seconds; ``received_commands`` are all commands in order.
+    ``clock`` gives monotonic seconds.
     """
 
     def __init__(
@@ -46,11 +49,17 @@ class E727Controller:
         self.settings = settings or ControllerSettings()
         self.state = ControllerState(self.settings, clock)
         self.lock = threading.RLock()
-        self.received_commands: list[str] = []
+        self._commands: deque[str] = deque(maxlen=MAX_COMMANDS)
+        self._n_commands = 0
         self._framer = CommandFramer()
         self._unread_command = ""
         self._cycle_cache: _CycleCache | None = None
         self._build_handlers()
+
+    @property
+    def received_commands(self) -> tuple[str, ...]:
+        """The newest commands in order."""
+        return tuple(self._commands)
 
     def _build_handlers(self) -> None:
         """Create the handlers for the present state."""
@@ -100,7 +109,8 @@ class E727Controller:
         if line is None:
             return self._refuse("a line that is too long", GcsCommandError(3))
         readable = ONE_BYTE.get(line, line)
-        self.received_commands.append(readable)
+        self._commands.append(readable)
+        self._n_commands += 1
         try:
             return self._dispatch(line)
         except GcsCommandError as error:
@@ -255,7 +265,7 @@ class E727Controller:
         """Counters and condition."""
         with self.lock:
             return {
-                "commands": len(self.received_commands),
+                "commands": self._n_commands,
                 "condition": self.state.describe(),
                 "servo": {name: axis.servo for name, axis in self.state.axes.items()},
                 "position_urad": {name: self.state.position(name) for name in self.state.axes},
