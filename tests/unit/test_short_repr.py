@@ -101,7 +101,7 @@ def has_arrays(name: str) -> bool:
     )
 
 
-@pytest.mark.parametrize("name", filter(has_arrays, escape_hw.__all__))
+@pytest.mark.parametrize("name", [*filter(has_arrays, escape_hw.__all__)])
 def test_no_public_class_prints_its_arrays(name: str) -> None:
     written = getattr(escape_hw, name).__dict__["__repr__"]
     # The generated one leads through functools or reprlib; one of our own is a plain function.
