@@ -114,15 +114,7 @@ class MainWindow(QMainWindow):
         self.header = HeaderBar(
             self.context, self.actions_by_name["open_loop"], self.actions_by_name["flatten"]
         )
-        self.fault_banner = FaultBanner(self.context, self.actions_by_name["clear_fault"])
-        self.alarms = LimitMonitor(settings.alarms, self._log_alarm)
-        self.alarm_banner = AlarmBanner(self.context, self.actions_by_name["acknowledge"])
-        self.alarm_dialog = AlarmDialog(self, settings)
-        # At once: they must also be there in the window after one that was killed.
-        self.alarm_dialog.accepted.connect(self._save_settings)
-        self.frozen_banner = FrozenBanner(self.context, self.actions_by_name["freeze"])
-        self.control_banner = ControlBanner(self.context, self.actions_by_name["take_control"])
-        self.server_banner = ServerBanner(self.context)
+        self._make_banners()
         self.tabs = self._make_tabs()
         self.panels = {kind.name: kind(self.context) for kind in panels}
         self.docks = {name: self._make_dock(panel) for name, panel in self.panels.items()}
@@ -138,11 +130,7 @@ class MainWindow(QMainWindow):
         self.update_timer = UpdateTimer(session, self.panels.values(), self.refresh)
         self.playback_bar = PlaybackBar(session)
         self.addToolBar(Qt.ToolBarArea.BottomToolBarArea, self.playback_bar)
-        self.replay = RecordingOpener(self, session)
-        self.run_browser, self.recording_browser = RunBrowser(self, session), RecordingBrowser(self, session)
-        self.camera_dialogs = {name: CameraDialog(self, session, theme, name) for name in ("wfs", "science")}
-        self.offsets_dialog = OffsetsDialog(self, session, theme)
-        self.connect_dialog = ConnectDialog(self, theme)
+        self._make_dialogs()
         self._connect_browsers()
         self._connect_panels()
         self._connect_session()
@@ -171,6 +159,26 @@ class MainWindow(QMainWindow):
             | QMainWindow.DockOption.AllowTabbedDocks
         )
         self.setTabPosition(Qt.DockWidgetArea.AllDockWidgetAreas, QTabWidget.TabPosition.North)
+
+    def _make_banners(self) -> None:
+        context, actions, settings = self.context, self.actions_by_name, self._settings
+        self.fault_banner = FaultBanner(context, actions["clear_fault"])
+        self.alarms = LimitMonitor(settings.alarms, self._log_alarm)
+        self.alarm_banner = AlarmBanner(context, actions["acknowledge"])
+        self.alarm_dialog = AlarmDialog(self, settings)
+        # At once: they must also be there in the window after one that was killed.
+        self.alarm_dialog.accepted.connect(self._save_settings)
+        self.frozen_banner = FrozenBanner(context, actions["freeze"])
+        self.control_banner = ControlBanner(context, actions["take_control"])
+        self.server_banner = ServerBanner(context)
+
+    def _make_dialogs(self) -> None:
+        session, theme = self.context.session, self.context.theme
+        self.replay = RecordingOpener(self, session)
+        self.run_browser, self.recording_browser = RunBrowser(self, session), RecordingBrowser(self, session)
+        self.camera_dialogs = {name: CameraDialog(self, session, theme, name) for name in ("wfs", "science")}
+        self.offsets_dialog = OffsetsDialog(self, session, theme)
+        self.connect_dialog = ConnectDialog(self, theme)
 
     def _fill_status_bar(self) -> None:
         self.statusBar().addWidget(self.notifications, 1)

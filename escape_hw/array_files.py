@@ -16,7 +16,7 @@ import numpy as np
 from numpy.lib import format as npy_format
 from numpy.typing import NDArray
 
-from escape_hw.bounded_files import MAX_ARRAY_BYTES, read_bounded
+from escape_hw.bounded_files import MAX_ARRAY_BYTES, read_bounded, reason_of
 from escape_hw.errors import ProductError
 
 
@@ -71,8 +71,7 @@ def read_array(path: Path, name: str = "") -> NDArray[Any]:
         return decode_array(_read_content(path), name)
     except Exception as error:
         # NumPy, astropy and zlib raise errors of many kinds for damaged files.
-        reason = error.strerror if isinstance(error, OSError) and error.strerror else error
-        raise ProductError(f"{path}: cannot be read ({reason})") from error
+        raise ProductError(f"{path}: cannot be read ({reason_of(error)})") from error
 
 
 def array_names(path: Path) -> list[str]:

@@ -41,6 +41,11 @@ def read_bounded(path: Path, limit: int) -> bytes:
     return content
 
 
+def reason_of(error: BaseException) -> str:
+    """The reason of an error for a message that names the file itself."""
+    return str(getattr(error, "strerror", None) or error)
+
+
 def shorten_path(path: str) -> str:
     """A path for a message; the middle of a very long one is left out."""
     return path if len(path) <= 300 else f"{path[:150]}...{path[-150:]}"

@@ -16,22 +16,34 @@ from escape_sim.devices.twins import shared_bench
 from escape_sim.stand_ins import LIBRARIES, StandInUnavailable, build_library
 from escape_sim.stand_ins.bench_server import StandInBenchServer
 
-#: On the increments of the real camera, and with a state kept often.
-OPTIONS = ("devices.wfs.region=[216,152,208,208]", "calibration.checkpoint_s=0.3")
+#: On the increments of the real camera.
+REGION = "devices.wfs.region=[216,152,208,208]"
+#: With a state kept often.
+OPTIONS = (REGION, "calibration.checkpoint_s=0.3")
 
 
-@pytest.fixture
-def bench() -> Iterator[tuple[StandInBenchServer, Spy]]:
-    """The simulated bench, in this process, that the server's real drivers reach."""
+def require_libraries() -> None:
+    """Skip where there is no compiler, and report it."""
     try:
         for name in LIBRARIES:
             build_library(name)
     except StandInUnavailable as reason:
         pytest.skip(str(reason))
-    server = StandInBenchServer(configuration(*OPTIONS))
+
+
+def simulated_bench(*options: str) -> Iterator[tuple[StandInBenchServer, Spy]]:
+    """The simulated bench, in this process, and what its mirror really does."""
+    require_libraries()
+    server = StandInBenchServer(configuration(*options))
     spy = Spy(shared_bench(server.config, server.shared))
     with server:
         yield server, spy
+
+
+@pytest.fixture
+def bench() -> Iterator[tuple[StandInBenchServer, Spy]]:
+    """The simulated bench that the server's real drivers reach."""
+    yield from simulated_bench(*OPTIONS)
 
 
 def on_metal(system: Path, server: StandInBenchServer, folder: Path) -> AbstractContextManager[Served]:

@@ -68,9 +68,9 @@ class Plot(pg.PlotWidget):  # type: ignore[misc]
         self._curves.append((item, number, alone))
         return item
 
-    def pin_left_axis(self, characters: int = 6) -> None:
-        """Fix the width of the left axis, so that plots above each other are aligned."""
-        self.getAxis("left").setWidth(self._theme.pixels(9 * characters))
+    def pin_left_axis(self) -> None:
+        """Fix the left axis to the width of six characters, so that plots above each other are aligned."""
+        self.getAxis("left").setWidth(self._theme.pixels(54))
 
     def hide_bottom_label(self) -> None:
         del self._labels["bottom"]

@@ -8,7 +8,6 @@ from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import DTypeLike
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,9 +98,9 @@ def time_alternately(
     return medians[0], medians[1] if peer is not None else None
 
 
-def product_rate(dtype: DTypeLike = np.float32, size: int = 512) -> float:
-    """Floating-point operations per second of a product of two ``(size, size)`` matrices, for floors."""
-    a = np.ones((size, size), dtype)
+def product_rate(size: int = 512) -> float:
+    """Floating-point operations per second of a single-precision product of two ``(size, size)`` matrices."""
+    a = np.ones((size, size), np.float32)
     times = [_elapsed(lambda: a @ a, 1) for _ in range(9)]
     return 2 * size**3 / min(times)
 

@@ -41,6 +41,11 @@ class DiscoveredDevice:
 Discoverer = Callable[[Sequence[str]], list[DiscoveredDevice]]
 
 
+def device_section_toml(section: str, driver: str, serial: str) -> str:
+    """Lines of a real device's section in a system file."""
+    return f'[devices.{section}]\nmode = "hardware"\ndriver = "{driver}"\nserial = "{serial}"'
+
+
 @dataclass(frozen=True, slots=True)
 class VendorLibrary:
     """Where a vendor's library may be; an entry point of ``escape.libraries``, named after its driver.

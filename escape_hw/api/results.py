@@ -123,7 +123,7 @@ _OUTLIER = 3.0
 
 
 def find_outliers(rms: NDArray[np.float64]) -> list[int]:
-    """Sub-apertures or actuators with an outlying rms residual, the worst first."""
+    """Indices of sub-apertures or actuators with an outlying rms residual ``(n,)``, the worst first."""
     limit = _OUTLIER * max(float(np.median(rms)), 1e-300)
     return [k for k in np.argsort(-rms).tolist() if rms[k] > limit]
 

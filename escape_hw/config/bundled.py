@@ -6,7 +6,7 @@ import importlib.resources
 import os
 from pathlib import Path
 
-from escape_hw.bounded_files import MAX_TEXT_BYTES, read_bounded, shorten_path
+from escape_hw.bounded_files import MAX_TEXT_BYTES, read_bounded, reason_of, shorten_path
 from escape_hw.errors import ConfigError
 from escape_hw.suggestions import closest_match
 
@@ -62,5 +62,4 @@ def find_system(system: str | os.PathLike[str]) -> tuple[str, str]:
     except UnicodeDecodeError as error:
         raise ConfigError(f"{name}: is not UTF-8 text ({error.reason} at byte {error.start})") from error
     except (OSError, ValueError) as error:
-        reason = error.strerror if isinstance(error, OSError) else error
-        raise ConfigError(f"{shorten_path(name)}: cannot be read ({reason})") from error
+        raise ConfigError(f"{shorten_path(name)}: cannot be read ({reason_of(error)})") from error

@@ -12,7 +12,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from escape_hw.bounded_files import MAX_TEXT_BYTES, read_bounded
+from escape_hw.bounded_files import MAX_TEXT_BYTES, read_bounded, reason_of
 from escape_hw.errors import IncompatibleProduct, ProductError
 
 if TYPE_CHECKING:
@@ -171,8 +171,7 @@ def _read_table(name: str, what: str = "table of positions") -> list[list[float]
         table = np.asarray(_decode_table(content), dtype=np.float64)
     except Exception as error:
         # NumPy and astropy raise errors of many kinds for damaged files.
-        reason = error.strerror if isinstance(error, OSError) and error.strerror else error
-        raise ValueError(f"the {what} {name!r} cannot be read ({reason})") from error
+        raise ValueError(f"the {what} {name!r} cannot be read ({reason_of(error)})") from error
     if table.ndim != 2 or not table.size:
         raise ValueError(f"the {what} {name!r} has shape {table.shape}; it needs rows and columns")
     rows: list[list[float]] = table.tolist()

@@ -199,7 +199,9 @@ def read_result(folder: Path | str) -> dict[str, Any]:
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
-        raise ProductError(f"{path}: cannot be read ({error.strerror}); is this a run folder?") from error
+        raise ProductError(
+            f"{path}: cannot be read ({error.strerror or error}); is this a run folder?"
+        ) from error
     except (ValueError, RecursionError) as error:
         raise ProductError(f"{path}: damaged; not a JSON document ({error})") from error
     if not isinstance(document, dict) or not isinstance(document.get("products"), dict):

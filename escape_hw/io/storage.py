@@ -9,6 +9,7 @@ import shutil
 import tempfile
 from pathlib import Path
 
+from escape_hw.bounded_files import reason_of
 from escape_hw.errors import StorageError
 
 #: Free space that must remain after writing a file, in bytes.
@@ -96,8 +97,9 @@ def check_readable(folder: Path) -> None:
         with os.scandir(folder):
             return
     except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise StorageError(f"{folder}: cannot be read ({reason}); choose an existing folder") from error
+        raise StorageError(
+            f"{folder}: cannot be read ({reason_of(error)}); choose an existing folder"
+        ) from error
 
 
 def write_atomic(path: Path, content: bytes) -> None:

@@ -23,10 +23,9 @@ from escape_hw.paper.experiments import (
     reproduce_shwfs,
     reproduce_table1,
 )
+from escape_hw.paper.frame_counts import FRAMES
 from escape_hw.paper.paired_seeds import (
-    LONG_FRAMES,
     PUSH_PULL_FRAMES,
-    SHORT_FRAMES,
     PairedSeeds,
     paired_document,
     reproduce_revolt,
@@ -238,27 +237,26 @@ CASES = {
     for case in (
         PaperCase(
             "table1", "registration from 20 seconds and from 3 minutes of data", "razor-shwfs",
-            {"short": 10_000, "long": 100_000}, _table1, save_table1, PAPER_REGISTRATION,
+            FRAMES["table1"], _table1, save_table1, PAPER_REGISTRATION,
         ),
         PaperCase(
             "shwfs", "Shack-Hartmann bench: matrices and loops", "razor-shwfs",
-            {"frames": 10_000, "loop_frames": 30_000}, reproduce_shwfs,
+            FRAMES["shwfs"], reproduce_shwfs,
             _save("shwfs", "Calibration without a source"), PAPER_REGISTRATION,
         ),
         PaperCase(
             "pywfs", "pyramid bench: matrices, optical gains, loops with and without them", "razor-pywfs",
-            {"frames": 100_000, "closed_frames": 20_000, "loop_frames": 20_000}, reproduce_pywfs,
+            FRAMES["pywfs"], reproduce_pywfs,
             _save("pywfs", "Calibration and optical gains without a source"),
         ),
         PaperCase(
             "maps", "telescope with a contaminated mirror: matrix, simulation and loops", "maps-nir",
-            {"frames": 60_000, "loop_frames": 10_000}, reproduce_maps,
+            FRAMES["maps"], reproduce_maps,
             _save("maps", "Calibration on the sky, with a contaminated mirror"),
         ),
         PaperCase(
             "revolt", "telescope with a Shack-Hartmann sensor: registration and paired loops", "revolt-shwfs",
-            # The loops are as short as they can be; a share shortens the calibrations only.
-            {"short": SHORT_FRAMES, "long": LONG_FRAMES}, reproduce_revolt, save_paired_seeds,
+            FRAMES["revolt"], reproduce_revolt, save_paired_seeds,
             (f"calibration.push_pull_frames={PUSH_PULL_FRAMES}",),
         ),
     )

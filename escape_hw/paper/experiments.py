@@ -21,10 +21,6 @@ from escape_hw.runtime.procedures.calibration_comparison import (
 )
 from escape_hw.runtime.procedures.model_psf import model_psf
 
-#: The paper's two runs: 20 seconds and 3 minutes at 500 Hz.
-SHORT_FRAMES, LONG_FRAMES = 10_000, 100_000
-#: Two minutes at 500 Hz: "a few minutes of sky-time" in the paper.
-MAPS_FRAMES = 60_000
 #: Pokes in closed loop (paper: 0.1 to 0.2 % of the stroke).
 CLOSED_POKE = 0.002
 #: The paper's registration, as overrides of a configuration; those of the user follow them.
@@ -46,14 +42,11 @@ class Table1Result:
     __repr__ = short_repr
 
 
-def reproduce_table1(bench: Bench, *, frames: Mapping[str, int] | None = None) -> Procedure[Table1Result]:
-    """ESCAPE with each number of frames (paper, Table 1), by the heading of the column.
-
-    By default they are SHORT and LONG of the paper.
-    """
+def reproduce_table1(bench: Bench, *, frames: Mapping[str, int]) -> Procedure[Table1Result]:
+    """ESCAPE with each number of frames (paper, Table 1), by the heading of the column."""
     result = Table1Result()
     try:
-        for label, count in (frames or {"SHORT": SHORT_FRAMES, "LONG": LONG_FRAMES}).items():
+        for label, count in frames.items():
             found = yield from calibrate_with_method(bench, "escape", frames=count)
             result.calibrations[label] = found
             if found.partial:
@@ -65,7 +58,7 @@ def reproduce_table1(bench: Bench, *, frames: Mapping[str, int] | None = None) -
 
 
 def reproduce_shwfs(
-    bench: Bench, *, frames: int = SHORT_FRAMES, loop_frames: int = 5000, realisations: int = 0
+    bench: Bench, *, frames: int, loop_frames: int, realisations: int = 0
 ) -> Procedure[CalibrationComparison]:
     """Calibrate a bench with and without a source, and close the loop with every matrix.
 
@@ -133,7 +126,7 @@ def _close_loops(bench: Bench, loop_frames: int, result: CalibrationComparison) 
 
 
 def reproduce_pywfs(
-    bench: Bench, *, frames: int = SHORT_FRAMES, closed_frames: int = 10_000, loop_frames: int = 5000
+    bench: Bench, *, frames: int, closed_frames: int, loop_frames: int
 ) -> Procedure[CalibrationComparison]:
     """Measure four matrices and the optical gains of three on a pyramid bench, and close six loops.
 
@@ -186,9 +179,7 @@ def _gains_and_loops(
             return
 
 
-def reproduce_maps(
-    bench: Bench, *, frames: int = MAPS_FRAMES, loop_frames: int = 5000
-) -> Procedure[CalibrationComparison]:
+def reproduce_maps(bench: Bench, *, frames: int, loop_frames: int) -> Procedure[CalibrationComparison]:
     """Measure a matrix on the sky, fit the registration, and close the loop with either matrix.
 
     The paper shows a matrix of 100 modes beside a simulated one and does not attempt a pseudo-synthetic

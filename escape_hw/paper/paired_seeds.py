@@ -19,6 +19,7 @@ from escape_hw.config.system import SystemConfig
 from escape_hw.errors import Aborted, CalibrationError, ConfigError
 from escape_hw.io import documents
 from escape_hw.paper.experiments import Table1Result, reproduce_table1
+from escape_hw.paper.frame_counts import PAIRED_LOOP_FRAMES, SEEDS
 from escape_hw.pipeline.statistics import CONFIDENCE, MeanInterval, mean_interval
 from escape_hw.runtime.procedures.calibration import calibrate_with_method, measured_calibration
 from escape_hw.runtime.procedures.criteria import largest_pull
@@ -26,11 +27,6 @@ from escape_hw.runtime.procedures.model_psf import model_psf
 
 #: The matrices compared, in the order of tables; differences are of a later one minus an earlier one.
 MATRICES = ("push-pull", "DO-CRIME", "ESCAPE")
-#: Seeds from which the intervals are computed.
-SEEDS = 5
-#: SHORT is close to the fewest frames of a matrix with a share of 0.1; LONG is a calibration on the telescope
-#: (``calibration.frames``); a loop is several times longer than the turbulence is correlated.
-SHORT_FRAMES, LONG_FRAMES, LOOP_FRAMES = 2500, 10_000, 600
 #: Push-pull takes about as long as SHORT: some twelve frames for the mirror to settle after each push and
 #: pull, and these.
 PUSH_PULL_FRAMES = 3
@@ -88,9 +84,9 @@ class PairedSeeds:
 def reproduce_revolt(
     bench: Bench,
     *,
-    short: int = SHORT_FRAMES,
-    long: int = LONG_FRAMES,
-    loop_frames: int = LOOP_FRAMES,
+    short: int,
+    long: int,
+    loop_frames: int = PAIRED_LOOP_FRAMES,
     seeds: int = SEEDS,
 ) -> Procedure[PairedSeeds]:
     """Registration from few and many frames, and loops with three matrices on several twins.

@@ -123,12 +123,12 @@ class LoopTiming:
         self._last = began_ns
         self._count += 1
 
-    def recent(self, seconds: float = 1.0) -> TimingSummary:
+    def recent(self) -> TimingSummary:
         """Summary of the last second, exact."""
         kept = min(self._count, _RECENT)
         order = np.arange(self._count - kept, self._count) % _RECENT
         began, took = np.array(self._began)[order], np.array(self._took)[order]
-        new = began > self._last - seconds * 1e9
+        new = began > self._last - 1e9
         if not new.any():
             return TimingSummary()
         p50, p99, largest = (np.percentile(took[new], [50, 99, 100]) / 1e3).tolist()

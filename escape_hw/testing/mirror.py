@@ -21,14 +21,14 @@ from escape_hw.testing.checks import FULL, READS, TINY, assert_identified, asser
 ROUNDING = 1e-9
 
 
-def small_poke(dm: DeformableMirror, amplitude: float = 0.01) -> NDArray[np.float64]:
+def small_poke(dm: DeformableMirror) -> NDArray[np.float64]:
     """The flat shape with one enabled actuator poked; legal from flat under any limits."""
     lim, flat = dm.limits, dm.flat
     enabled = np.setdiff1d(np.arange(flat.size), lim.disabled)
     if not enabled.size:
         raise unittest.SkipTest(f"{dm.name}: every actuator is disabled")
     bounds = (lim.max_stroke, lim.max_slew, lim.max_neighbour, lim.max_mean, lim.max_abs_sum)
-    size = min(amplitude, *(0.5 * bound for bound in bounds if bound is not None))
+    size = min(0.01, *(0.5 * bound for bound in bounds if bound is not None))
     chosen = enabled[np.abs(flat[enabled]).argmin()]
     flat[chosen] += -size if flat[chosen] > 0 else size
     return flat

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 from campaign_table import Campaign
-from running import ESCAPE
+from running import ESCAPE, words_of_other_user
 
 pytestmark = [
     pytest.mark.campaign,
@@ -24,7 +24,6 @@ pytestmark = [
 ]
 
 SEED, NUMBER = 9, 50
-NOBODY = 65534
 #: Fields of an environment, by the words for them.
 LOCALES: dict[str, dict[str, str]] = {
     "": {},
@@ -99,15 +98,6 @@ def preparation(closed: list[int], descriptors: int | None, size: int | None) ->
     return prepare
 
 
-def other_user() -> tuple[str, ...]:
-    """Words that run a command without privileges; none where that user cannot read the package."""
-    if os.getuid() != 0 or shutil.which("setpriv") is None:
-        return ()
-    words = ("setpriv", f"--reuid={NOBODY}", f"--regid={NOBODY}", "--clear-groups")
-    probe = [*words, sys.executable, "-c", "import escape_hw.cli, escape_sim, escape_drivers"]
-    return () if subprocess.run(probe, capture_output=True, check=False, cwd="/").returncode else words
-
-
 def words_for_mounting(target: str) -> tuple[str, ...]:
     """Words that start a command whose mounts nobody else sees; none where this computer allows no mounts."""
     if shutil.which("unshare") is None:
@@ -133,7 +123,7 @@ def verdict(done: subprocess.CompletedProcess[bytes], streams: dict[str, str]) -
 
 
 def test_environments(campaign: Campaign, place: Path) -> None:
-    rng, another = random.Random(SEED), other_user()
+    rng, another = random.Random(SEED), words_of_other_user() or ()
     tried = commands(place / "im.fits", place / "small.toml")
     homes = {
         "usual": str(place / "home"), "missing": str(place / "missing"), "unreadable": str(place / "secret"),

@@ -7,6 +7,9 @@ from typing import Any
 
 from escape_hw.api.device import Device
 
+#: Name of a case, class, check that must fail (without ``check_``), and the members that break it.
+Broken = tuple[str, type[Device], str, dict[str, Any]]
+
 
 def broken_class(base: type[Device], defects: dict[str, Any]) -> type[Device]:
     """A subclass with these members; final methods are replaced after its definition."""

@@ -42,7 +42,7 @@ def test_every_script_is_quoted():
 
 @pytest.mark.parametrize("folder", FIRST)
 def test_the_realisations_are_those_of_the_study_and_of_one_commit_for_each_system(folder):
-    tables = (ROOT / "docs" / "studies" / folder).glob("*.jsonl")
+    tables = list((ROOT / "docs" / "studies" / folder).glob("*.jsonl"))
     rows = [row for table in tables for row in read_lines(table)]
     assert min(row["realisation"] for row in rows) == FIRST[folder]
     made = {(row["asked"]["system"], row["commit"]) for row in rows}
@@ -59,6 +59,7 @@ def test_the_page_of_faint_stars_has_its_tables(capsys, import_study):
     study = import_study("loops/star_magnitudes.py")
     for folder in (ROOT / "docs" / "studies" / "star-magnitudes" / name for name in ("", "sky", "long")):
         tables = {float(path.stem.rpartition("-")[2]): read_lines(path) for path in folder.glob("*.jsonl")}
+        assert tables
         study.print_table(dict(sorted(tables.items())))
         printed = capsys.readouterr().out
         assert len(tables) == printed.count("\n") - 2

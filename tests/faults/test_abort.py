@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 import threading
 import time
+from functools import partial
 
 import numpy as np
 import pytest
@@ -23,6 +24,8 @@ from escape_hw.paper.experiments import reproduce_shwfs, reproduce_table1
 from escape_hw.paper.paired_seeds import reproduce_revolt
 from escape_hw.runtime.procedures.model_psf import model_psf
 from escape_hw.runtime.session.record import without_turbulence
+
+reproduce = partial(reproduce_shwfs, loop_frames=5000)
 
 
 def calm(bench, procedure):
@@ -52,10 +55,10 @@ PLACES = {
         "closed loop",
         0.004,
     ),
-    "reproduce, push-pull": (lambda b, g: reproduce_shwfs(b, frames=400), "push-pull", 0.3),
-    "reproduce, DO-CRIME": (lambda b, g: reproduce_shwfs(b, frames=50_000), "DO-CRIME", 0.01),
-    "reproduce, model PSF": (lambda b, g: reproduce_shwfs(b, frames=400), "model PSF", 0.0),
-    "reproduce, best gain": (lambda b, g: reproduce_shwfs(b, frames=400), "loop at gain", 0.2),
+    "reproduce, push-pull": (lambda b, g: reproduce(b, frames=400), "push-pull", 0.3),
+    "reproduce, DO-CRIME": (lambda b, g: reproduce(b, frames=50_000), "DO-CRIME", 0.01),
+    "reproduce, model PSF": (lambda b, g: reproduce(b, frames=400), "model PSF", 0.0),
+    "reproduce, best gain": (lambda b, g: reproduce(b, frames=400), "loop at gain", 0.2),
     "reproduce, paired loops": (lambda b, g: reproduce_revolt(b, short=400, long=400), "loop at gain", 0.2),
     "table 1": (lambda b, g: reproduce_table1(b, frames={"SHORT": 400, "LONG": 99_999}), "DO-CRIME", 0.006),
 }
@@ -141,7 +144,7 @@ def test_a_partial_docrime_is_a_good_matrix_with_correct_errors(good, place):
 def test_a_reproduction_saves_the_finished_parts(good):
     stop = StopThere("loop at gain", 0.2)
     with small() as bench, pytest.raises(Aborted) as caught:
-        bench.run(reproduce_shwfs(bench, frames=400), observers=(stop,), abort=stop.abort)
+        bench.run(reproduce(bench, frames=400), observers=(stop,), abort=stop.abort)
     partial = caught.value.partial
     assert list(partial.calibrations) == ["push-pull", "DO-CRIME", "ESCAPE"]
     assert not any(calibration.partial for calibration in partial.calibrations.values())
@@ -153,7 +156,7 @@ def test_a_reproduction_saves_the_finished_parts(good):
 def test_stopped_in_push_pull_a_reproduction_keeps_the_other_matrices(good):
     stop = StopThere("push-pull", 0.0)
     with small() as bench, pytest.raises(Aborted) as caught:
-        bench.run(reproduce_shwfs(bench, frames=400), observers=(stop,), abort=stop.abort)
+        bench.run(reproduce(bench, frames=400), observers=(stop,), abort=stop.abort)
     calibrations = caught.value.partial.calibrations
     assert list(calibrations)[-2:] == ["DO-CRIME", "ESCAPE"]
     assert not calibrations["ESCAPE"].partial
@@ -163,7 +166,7 @@ def test_stopped_in_push_pull_a_reproduction_keeps_the_other_matrices(good):
 def test_all_matrices_of_a_reproduction_share_lenslets_and_references(good):
     stop = StopThere("model PSF", 0.0)
     with small() as bench, pytest.raises(Aborted) as caught:
-        bench.run(reproduce_shwfs(bench, frames=400), observers=(stop,), abort=stop.abort)
+        bench.run(reproduce(bench, frames=400), observers=(stop,), abort=stop.abort)
     ours, *others = (one.grid for one in caught.value.partial.calibrations.values())
     assert len(others) == 2
     for other in others:
@@ -175,7 +178,7 @@ def test_all_matrices_of_a_reproduction_share_lenslets_and_references(good):
 def test_stopped_before_sprint_a_reproduction_keeps_no_escape_matrix(good):
     stop = StopThere("DO-CRIME", 0.01)
     with small() as bench, pytest.raises(Aborted) as caught:
-        bench.run(reproduce_shwfs(bench, frames=50_000), observers=(stop,), abort=stop.abort)
+        bench.run(reproduce(bench, frames=50_000), observers=(stop,), abort=stop.abort)
     assert list(caught.value.partial.calibrations) == ["DO-CRIME"]
     assert caught.value.partial.calibrations["DO-CRIME"].partial
 

@@ -2,35 +2,33 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from command_line import document, escape
 from small_system import SMALL, configuration
 
 from escape_hw import register_device
-from escape_hw.cli import main
 from escape_hw.config import registry
 from escape_hw.io.fits.matrix import load_matrix, save_matrix
 from escape_hw.io.provenance import Provenance
 from escape_hw.testing import FaultyCamera, FaultyMirror
 from escape_sim.devices import twins as devices
 
+__all__ = ["document", "escape"]
+
 
 @pytest.fixture
-def run(capsys, monkeypatch, tmp_path):
+def run(document, monkeypatch, tmp_path):
     """Run a command with ``--json``: exit code, document, standard error."""
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
     monkeypatch.setattr("escape_hw.runtime.procedures.products.write_report", lambda folder: folder)
 
     def call(*words: object) -> tuple[int, dict, str]:
-        capsys.readouterr()
-        with pytest.raises(SystemExit) as ended:
-            main([*map(str, words), "--json"])
-        out, err = capsys.readouterr()
+        code, answer, err = document(*words)
         assert "Traceback" not in err
-        return ended.value.code or 0, json.loads(out, parse_constant=pytest.fail), err
+        return code, answer, err
 
     return call
 

@@ -98,7 +98,7 @@ def test_loss_that_leaves_too_few_complete_frames_is_an_error():
 def test_a_reproduction_with_too_few_frames_is_refused_before_its_baseline(bench):
     frame = bench.wfs.next_frame(1.0).index
     with pytest.raises(TooFewFrames, match="50 frames cannot constrain 30 modes"):
-        bench.run(reproduce_shwfs(bench, frames=50))
+        bench.run(reproduce_shwfs(bench, frames=50, loop_frames=5000))
     assert bench.wfs.next_frame(1.0).index <= frame + 2
     assert_flat(bench)
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import gc
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from PySide6.QtCore import QCoreApplication, QEvent, QPoint, Qt
@@ -40,6 +41,32 @@ def show_window(
     window.update_timer.tick(force=True)
     QCoreApplication.processEvents()
     return window
+
+
+def wait_for(done: Callable[[], object]) -> None:
+    """Process events until a condition is true."""
+    for _ in range(12_000):
+        if done():
+            return
+        QTest.qWait(10)
+    raise AssertionError("never happened")
+
+
+def refresh(window: MainWindow) -> None:
+    """Process events, and refresh all panels, none of which may fail."""
+    QApplication.processEvents()
+    window.update_timer.tick(force=True)
+    QApplication.processEvents()
+    assert window.update_timer.failed_panels == {}
+
+
+def until(what: Callable[[], bool], window: MainWindow) -> None:
+    """Refresh a window until a condition is true."""
+    deadline = time.monotonic() + 30
+    while not what():
+        assert time.monotonic() < deadline
+        refresh(window)
+        time.sleep(0.005)
 
 
 def dispose(window: MainWindow) -> None:

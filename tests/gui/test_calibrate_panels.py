@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from itertools import combinations
 from pathlib import Path
 
 import fake_results as fake
 import numpy as np
 import pytest
-from gui_windows import dispose, enter_argument, show_window
+from gui_windows import dispose, enter_argument, refresh, show_window, until
 from pyqtgraph import AxisItem
 from PySide6.QtCore import QPoint, QRectF, Qt
 from PySide6.QtGui import QImage, QPainter
@@ -113,21 +112,6 @@ def form(session: Session, tmp_path: Path) -> Iterator[MainWindow]:
     dispose(window)
 
 
-def look(window: MainWindow) -> None:
-    QApplication.processEvents()
-    window.update_timer.tick(force=True)
-    QApplication.processEvents()
-    assert window.update_timer.failed_panels == {}
-
-
-def until(what: Callable[[], bool], window: MainWindow) -> None:
-    deadline = time.monotonic() + 30
-    while not what():
-        assert time.monotonic() < deadline
-        look(window)
-        time.sleep(0.005)
-
-
 def press(button: QPushButton) -> None:
     QTest.mouseClick(button, Qt.MouseButton.LeftButton)
 
@@ -143,23 +127,23 @@ def measure(source: ScriptedSource, share: float) -> None:
 # ---------------------------------------------------------------- mode maps
 def test_mode_maps_fill_in_while_they_are_measured(calibrate, source):
     panel = calibrate.panels["modes"]
-    look(calibrate)
+    refresh(calibrate)
     assert panel.shows_placeholder
     source.change(phase=Phase.PROCEDURE, active_run=RUNNING)
     measure(source, 1e-4)
-    look(calibrate)
+    refresh(calibrate)
     assert not panel.shows_placeholder
     assert panel.matrix_selector.currentData() == LIVE_LABEL
     assert panel.matrix_selector.currentText() == "DO-CRIME, live"
     pale = contrast(panel)
     measure(source, 1.0)
-    look(calibrate)
+    refresh(calibrate)
     assert contrast(panel) > 2 * pale
     panel.weight_by_snr.setChecked(False)
     assert contrast(panel) > 2 * pale
     # Aborted without a product.
     source.change(phase=Phase.IDLE, active_run=None)
-    look(calibrate)
+    refresh(calibrate)
     assert panel.matrix_selector.currentText() == "DO-CRIME, as measured"
 
 
@@ -167,11 +151,11 @@ def test_live_maps_belong_to_the_run_that_measures(calibrate, source):
     panel = calibrate.panels["modes"]
     source.change(phase=Phase.PROCEDURE, active_run=RUNNING)
     measure(source, 1.0)
-    look(calibrate)
+    refresh(calibrate)
     assert panel.matrix_selector.currentData() == LIVE_LABEL
     # The next run has measured nothing yet.
     source.change(active_run=RUNNING.model_copy(update={"id": 4, "completed": 0}))
-    look(calibrate)
+    refresh(calibrate)
     assert LIVE_LABEL not in panel.matrices
 
 
@@ -180,7 +164,7 @@ def test_controls_of_the_maps_follow_what_is_visible_and_not_what_they_widen(
 ) -> None:
     # Otherwise the area around, which gives the panel the width that its controls need, never ends.
     measure(source, 1.0)
-    look(calibrate)
+    refresh(calibrate)
     panel, area = calibrate.panels["modes"], calibrate.docks["modes"].widget()
     assert isinstance(panel, ModesPanel)
 
@@ -227,7 +211,7 @@ def test_a_click_shows_the_mode_in_every_matrix(calibrate, source, tmp_path):
         products.append(ProductEntry(name=method, kind="matrix", path=str(path)))
     source.change(products=tuple(products))
     until(lambda: "ESCAPE" in panel.matrices, calibrate)
-    look(calibrate)
+    refresh(calibrate)
     mosaic = panel.mosaic
     top, left = mosaic._layout.corner(4)
     place = mosaic._box.mapViewToScene(mosaic._box.mapToView(mosaic._box.rect().center()))
@@ -269,9 +253,9 @@ def test_matrices_and_gains_are_listed_again_after_a_crash_of_the_engine(calibra
     modes.matrix_selector.activated.emit(0)
     source.fail("the engine died")
     source.change(engine_pid=0)
-    look(calibrate)
+    refresh(calibrate)
     source.change(engine_pid=12, phase=Phase.STARTING, fault=None)
-    look(calibrate)
+    refresh(calibrate)
     assert [modes.matrix_selector.itemData(k) for k in range(modes.matrix_selector.count())] == names
     assert modes.matrix_selector.currentData() == names[0]
     assert not modes.shows_placeholder
@@ -290,9 +274,9 @@ def test_pages_change(calibrate, source):
     panel = calibrate.panels["modes"]
     source.change(phase=Phase.PROCEDURE, active_run=RUNNING)
     measure(source, 1.0)
-    look(calibrate)
+    refresh(calibrate)
     panel.mosaic.setMaximumSize(240, 160)
-    look(calibrate)
+    refresh(calibrate)
     page, pages = panel.mosaic.page
     assert (page, pages > 1) == (0, True)
     press(panel._next_button)
@@ -310,7 +294,7 @@ def test_a_short_result_after_a_long_one_has_no_gaps(calibrate: MainWindow, sour
         source.change(last_run=FinishedRun(id=k, name=f"run {k}", finish=Finish.DONE, document=document))
         for _ in range(3):
             source.change()
-            look(calibrate)
+            refresh(calibrate)
     assert panel.numbers.text() == "Sub-apertures: 448"
     assert panel.numbers.height() < 2 * panel.numbers.fontMetrics().lineSpacing()
 
@@ -352,7 +336,7 @@ def test_sprint_shows_its_iterations_and_its_end(calibrate, source):
     source.push("registration", path[:6] * TO_STREAM_UNITS)
     source.push("registration_sigma", np.full(5, np.nan))
     source.push("step_norm", norm[:6])
-    look(calibrate)
+    refresh(calibrate)
     assert panel._indicator.text == "running, 6 iterations"
     source.push("registration", path * TO_STREAM_UNITS)
     source.push("registration_sigma", estimate.sigma * TO_STREAM_UNITS)
@@ -360,7 +344,7 @@ def test_sprint_shows_its_iterations_and_its_end(calibrate, source):
     document = calibration_document(fake.calibration("escape"))
     ended = FinishedRun(id=3, name="escape", finish=Finish.DONE, document=document)
     source.change(phase=Phase.IDLE, active_run=None, last_run=ended)
-    look(calibrate)
+    refresh(calibrate)
     assert panel._indicator.text == "converged, 18 iterations"
     assert "±" in panel._values[0].text()
     assert "tangential_scaling is consistent with zero" in panel._notes.text()
@@ -368,11 +352,11 @@ def test_sprint_shows_its_iterations_and_its_end(calibrate, source):
     for k, name, told in ((4, "push-pull", None), (5, "gains", False)):
         ended = FinishedRun(id=k, name=name, finish=Finish.ABORTED, document={"converged": told})
         source.change(last_run=ended)
-        look(calibrate)
+        refresh(calibrate)
         assert panel._indicator.text == "converged, 18 iterations"
     for size in ((1600, 1000), (1280, 760)):
         calibrate.resize(*size)
-        look(calibrate)
+        refresh(calibrate)
         places = labels(panel.plot._plots[0].getAxis("left"))
         assert places, size
         assert not any(a.intersects(b) for a, b in combinations(places, 2)), f"labels overlap at {size}"
@@ -387,7 +371,7 @@ def test_the_profile_of_the_influence_functions_is_shown(calibrate, source):
     document = calibration_document(fake.calibration("escape"))
     source.push("registration", np.zeros((1, 5)))
     source.change(last_run=FinishedRun(id=3, name="escape", finish=Finish.DONE, document=document))
-    look(calibrate)
+    refresh(calibrate)
     panel.tabs.setCurrentWidget(panel.profile)
     nominal, fitted, edge = (band.line.getData()[1] for band in panel.profile.bands)
     np.testing.assert_allclose(nominal, profile.nominal)
@@ -403,7 +387,7 @@ def test_a_drift_is_shown(calibrate, source):
     track[:, 0] = np.arange(30)
     track[:, 1] = 0.001 * np.arange(30)
     source.push("registration_track", track)
-    look(calibrate)
+    refresh(calibrate)
     assert panel.tabs.currentIndex() == 1
     np.testing.assert_allclose(panel.export_arrays()[-1].data[-1, 1], 2.9)
 
@@ -416,7 +400,7 @@ def test_gains_appear_round_by_round(calibrate, source):
     source.push("gains_sigma", gains.sigma)
     source.push("gains_smooth", gains.trend)
     source.push("gains_rounds", np.stack([gains.best, 1.01 * gains.best]))
-    look(calibrate)
+    refresh(calibrate)
     assert "median 0.700" in panel._legend.text()
     assert "2 rounds" in panel._legend.text()
     assert list(panel.plot._boxes) == ["left"], "the help promises a second axis for matrices of both kinds"
@@ -432,7 +416,7 @@ def press_box(panel: GainsPanel) -> None:
 # ---------------------------------------------------------------- procedures
 def test_a_procedure_is_started_from_the_form(form, source, control):
     panel = form.panels["procedure"]
-    look(form)
+    refresh(form)
     assert [panel.choice.itemText(k) for k in range(panel.choice.count())] == ["ESCAPE", "Optical gains"]
     assert not panel.start.isEnabled()
     enter_argument(panel.form, "frames", "200")
@@ -449,13 +433,13 @@ def test_a_procedure_is_started_from_the_form(form, source, control):
 
 def test_an_invalid_form_starts_nothing(form, control):
     panel = form.panels["procedure"]
-    look(form)
+    refresh(form)
     until(panel.start.isEnabled, form)
     enter_argument(panel.form, "frames", "zero")
     assert not panel.start.isEnabled()
     press(panel.check)
     assert "'zero' is no number" in panel.plan.text()
-    look(form)
+    refresh(form)
     assert not panel.start.isEnabled()
     assert "not checked" in panel.start.toolTip()
 
@@ -463,7 +447,7 @@ def test_an_invalid_form_starts_nothing(form, control):
 def test_a_refusal_is_shown_below_the_form(form, control):
     panel = form.panels["procedure"]
     control.refuse = "no light on the sensor"
-    look(form)
+    refresh(form)
     until(lambda: "no light" in panel.plan.text(), form)
     assert not panel.start.isEnabled()
     control.refuse = ""
@@ -471,14 +455,14 @@ def test_a_refusal_is_shown_below_the_form(form, control):
 
 def test_a_procedure_is_monitored_paused_and_aborted(form, source, control):
     panel = form.panels["procedure"]
-    look(form)
+    refresh(form)
     assert not panel.abort.isEnabled()
     assert "no procedure is running" in panel.abort.toolTip()
     measure(source, 1.0)
     source.change(phase=Phase.PROCEDURE, active_run=RUNNING)
-    look(form)
+    refresh(form)
     source.change()
-    look(form)
+    refresh(form)
     assert panel.progress.text() == "DO-CRIME: 610 of 1000 frames, 4:12 min left"
     assert "worst mode 1: SNR" in panel._metrics.text()
     assert panel.bar.value() == 610
@@ -486,7 +470,7 @@ def test_a_procedure_is_monitored_paused_and_aborted(form, source, control):
     press(panel.pause)
     until(lambda: ("pause", {}) in control.asked, form)
     source.change(active_run=RUNNING.model_copy(update={"paused": True}))
-    look(form)
+    refresh(form)
     assert panel.pause.text() == "Resume"
     press(panel.pause)
     until(lambda: ("resume", {}) in control.asked, form)
@@ -499,13 +483,13 @@ def test_the_result_is_compared_with_the_previous_one(form, source):
     document = calibration_document(fake.calibration("escape"))
     first = FinishedRun(id=1, name="escape", finish=Finish.DONE, folder="/runs/1", document=document)
     source.change(last_run=first)
-    look(form)
+    refresh(form)
     assert panel.outcome.text() == "Done: escape"
     assert "Δ" not in panel.numbers.text()
     assert not panel.report.isVisible()
     second = first.model_copy(update={"id": 2, "products": {"report": "/runs/2/report.html"}})
     source.change(last_run=second)
-    look(form)
+    refresh(form)
     assert "(Δ 0.00 ± " in panel.numbers.text()
     assert panel.report.isVisible()
 
@@ -514,52 +498,52 @@ def test_the_result_outlasts_the_engine_but_not_the_bench(form, source, session,
     panel = form.panels["procedure"]
     document = calibration_document(fake.calibration("escape"))
     source.change(last_run=FinishedRun(id=2, name="escape", finish=Finish.DONE, document=document))
-    look(form)
+    refresh(form)
     told = panel.numbers.text()
     source.change(engine_pid=12, last_run=None)
-    look(form)
+    refresh(form)
     assert panel._result_area.isVisible()
     assert panel.numbers.text() == told
     source.change(last_run=FinishedRun(id=3, name="escape", finish=Finish.DONE, document=document))
-    look(form)
+    refresh(form)
     assert "Δ" in panel.numbers.text(), "the result of the engine before is compared"
     session.set_source(ScriptedSource(running(system="maps-nir")), control)
-    look(form)
+    refresh(form)
     assert not panel._result_area.isVisible()
 
 
 def test_new_matrices_are_offered_to_the_form(form, source):
     panel = form.panels["procedure"]
-    look(form)
+    refresh(form)
     panel.choice.setCurrentIndex(1)
     box = panel.form.fields["im"]
     assert box.currentText() == "–"
     names = ("first", "second")
     source.change(products=tuple(ProductEntry(name=name, kind="matrix", path="/x.fits") for name in names))
-    look(form)
+    refresh(form)
     assert box.currentText() == "second"
     enter_argument(panel.form, "im", "first")
     source.change(
         products=(*source.state.products, ProductEntry(name="third", kind="matrix", path="/x.fits"))
     )
-    look(form)
+    refresh(form)
     assert box.currentText() == "first"
 
 
 def test_the_newest_matrix_is_the_default_also_when_those_of_a_run_arrive_one_by_one(form, source):
     panel = form.panels["procedure"]
-    look(form)
+    refresh(form)
     panel.choice.setCurrentIndex(1)
     for name in ("escape-1-docrime", "escape-1"):
         entry = ProductEntry(name=name, kind="matrix", path="/x.fits")
         source.change(products=(*source.state.products, entry))
-        look(form)
+        refresh(form)
         assert panel.form.fields["im"].currentText() == name
 
 
 def test_without_control_nothing_starts(session, source, control, form):
     source.change(lease=None)
-    look(form)
+    refresh(form)
     panel = form.panels["procedure"]
     assert not panel.start.isEnabled()
     assert "take control" in panel.start.toolTip()
@@ -576,7 +560,7 @@ def test_a_converged_fit_with_a_noisy_mode_or_a_misfit_is_not_green(calibrate, s
     document = {**calibration_document(fake.calibration("escape")), "snr": {"min": 0.35, "median": 9.0}}
     document |= {"warnings": [], "clipped_pokes": 350, "frames": 1000}
     source.change(last_run=FinishedRun(id=3, name="escape", finish=Finish.DONE, document=document))
-    look(calibrate)
+    refresh(calibrate)
     sprint, procedure = calibrate.panels["sprint"], calibrate.panels["procedure"]
     assert (sprint._indicator.level, sprint._indicator.text) == (Level.WARNING, "converged, 18 iterations")
     line = "Usable: SNR 0.35 in the worst mode"
@@ -591,7 +575,7 @@ def test_a_converged_fit_with_a_noisy_mode_or_a_misfit_is_not_green(calibrate, s
     assert line in told.text
     document = {**calibration_document(fake.calibration("escape", fits=False)), "warnings": []}
     source.change(last_run=FinishedRun(id=5, name="escape", finish=Finish.DONE, document=document))
-    look(calibrate)
+    refresh(calibrate)
     words = "converged, but the model does not fit"
     assert (sprint._indicator.level, sprint._indicator.text) == (Level.WARNING, f"{words}, 18 iterations")
     assert f"Usable: {words} (14% of the matrix" in sprint._notes.text()

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from gui_windows import settle
+from gui_windows import settle, wait_for
 from PySide6.QtCore import QCoreApplication, Qt
 from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QFileDialog
@@ -30,14 +30,6 @@ def entry(
     """An entry of some seconds ago."""
     at = datetime.now(UTC) - timedelta(seconds=seconds)
     return NightEntry(number=number, at_utc=format_utc(at), kind=kind, text=text, values=values)
-
-
-def wait_for(done) -> None:
-    for _ in range(12_000):
-        if done():
-            return
-        QTest.qWait(10)
-    raise AssertionError("never happened")
 
 
 @pytest.fixture

@@ -6,12 +6,12 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from gui_windows import dispose, show_window
+from gui_windows import dispose, refresh, show_window, until
 from PySide6.QtCore import Qt
 from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QApplication, QComboBox, QLineEdit
 from scripted import ScriptedControl, ScriptedSource
-from test_calibrate_panels import PROCEDURES, RUNNING, look, press, until
+from test_calibrate_panels import PROCEDURES, RUNNING, press
 
 from escape_gui.client.session import EmptySource, Session
 from escape_gui.main_window import MainWindow
@@ -43,7 +43,7 @@ def calibrate(session: Session, tmp_path: Path) -> Iterator[MainWindow]:
     window = show_window(session, tmp_path / "gui.json", (ProcedurePanel,), Settings(workspace="calibrate"))
     window.docks["procedure"].show()
     window.activateWindow()
-    look(window)
+    refresh(window)
     yield window
     dispose(window)
 
@@ -91,17 +91,17 @@ def test_a_replaced_connection_loses_no_argument(
     assert panel.form.arguments() == ENTERED
     # The server is lost, another process of it is found, and later fetches its procedures.
     session.set_source(EmptySource(), None)
-    look(calibrate)
+    refresh(calibrate)
     assert not panel.form.isVisible()
     again = idle_source()
     again.entries, again.state = (), again.state.model_copy(update={"engine_pid": 12, "products": ()})
     session.set_source(again, control)
-    look(calibrate)
+    refresh(calibrate)
     again.entries = PROCEDURES
-    look(calibrate)
+    refresh(calibrate)
     assert panel.choice.currentText() == "ESCAPE"
     again.change(products=matrices("first", "third"))
-    look(calibrate)
+    refresh(calibrate)
     assert panel.form.isVisible()
     assert panel.form.arguments() == ENTERED
     until(panel.start.isEnabled, calibrate)
@@ -119,10 +119,10 @@ def test_another_engine_loses_no_argument_and_no_focus(
     field = panel.form.fields["frames"]
     source.fail()
     source.change(engine_pid=0)
-    look(calibrate)
+    refresh(calibrate)
     asked = len(control.asked)
     source.change(engine_pid=12, phase=Phase.STARTING, fault=None)
-    look(calibrate)
+    refresh(calibrate)
     assert QApplication.focusWidget() is field
     QTest.keyClicks(field, "0")
     assert panel.form.arguments() == ENTERED
@@ -143,14 +143,14 @@ def test_another_server_gets_the_arguments_that_are_valid_there(
     other = idle_source()
     other.entries = (gains, escape.model_copy(update={"parameters": (less, snr, *others[:-1])}))
     session.set_source(other, control)
-    look(calibrate)
+    refresh(calibrate)
     assert panel.choice.currentText() == "ESCAPE"
     assert panel.form.arguments() == {"snr": 12.5, "pokes": "anticorrelated", "plain": True}
     assert panel.form.fields["frames"].text() == "50"
     assert "Entered before, but not valid here: Frames 200." in panel._description.text()
     # Back on the first server nothing is lost.
     session.set_source(idle_source(), control)
-    look(calibrate)
+    refresh(calibrate)
     assert panel.form.arguments() == ENTERED
     assert "not valid" not in panel._description.text()
 
@@ -174,12 +174,12 @@ def test_start_stays_disabled_until_the_run_is_in_the_state(
     until(lambda: control.verbs[-1] == "start", calibrate)
     for _ in range(3):
         source.change()
-        look(calibrate)
+        refresh(calibrate)
         assert not panel.start.isEnabled()
         assert "it is being started" in panel.start.toolTip()
         press(panel.start)
     source.change(phase=Phase.PROCEDURE, active_run=RUNNING)
-    look(calibrate)
+    refresh(calibrate)
     assert "a procedure is running" in panel.start.toolTip()
     source.change(phase=Phase.IDLE, active_run=None)
     source.change(last_run=FinishedRun(id=3, name="escape", finish=Finish.DONE))

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import json
 import shutil
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 import recorded_run
 import shiboken6
-from gui_windows import dispose
+from gui_windows import dispose, until
 from PySide6.QtCore import QEvent, QMimeData, QPoint, QPointF, Qt, QUrl
 from PySide6.QtGui import QDragEnterEvent, QDropEvent
 from PySide6.QtWidgets import QApplication, QFileDialog
@@ -52,16 +51,6 @@ def empty(panels: tuple[type[Panel], ...]) -> Iterator[MainWindow]:
     dispose(window)
     session.close()
     session.deleteLater()
-
-
-def until(what: Callable[[], bool], window: MainWindow) -> None:
-    deadline = time.monotonic() + 30
-    while not what():
-        assert time.monotonic() < deadline
-        QApplication.processEvents()
-        window.update_timer.tick(force=True)
-        assert window.update_timer.failed_panels == {}
-        time.sleep(0.005)
 
 
 def is_open(window: MainWindow) -> bool:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+from gui_windows import wait_for
 from PySide6.QtCore import QPoint, QPointF, Qt
 from PySide6.QtGui import QWheelEvent
 from PySide6.QtTest import QTest
@@ -20,14 +20,6 @@ from escape_hw.io.provenance import format_utc
 from escape_hw.remote.state import RecordingState
 from escape_hw.runtime.session.recordings import RecordingDescription, find_recordings, write_description
 from escape_hw.streams.recording.block_file import HEADER, write_block
-
-
-def wait_for(done: Callable[[], object]) -> None:
-    for _ in range(12_000):
-        if done():
-            return
-        QTest.qWait(10)
-    raise AssertionError("never happened")
 
 
 def record(folder: Path, n: int = 1024, n_modes: int = 20) -> Path:

@@ -12,6 +12,15 @@ SPOT = 2.3
 N_PIX = 8
 
 
+def turbulence(n: int, rms_m: float, seed: int = 1) -> NDArray[np.float32]:
+    """Optical path of a random screen ``(n, n)`` in metres."""
+    rng = np.random.default_rng(seed)
+    f = np.fft.fftfreq(n)
+    shape = (f[:, None] ** 2 + f**2 + (1 / (4 * n)) ** 2) ** (-11 / 12)
+    opd = np.fft.ifft2(np.fft.fft2(rng.standard_normal((n, n))) * shape).real
+    return (opd * rms_m / opd.std()).astype(np.float32)
+
+
 def pupil_amplitude(n: int, beam: float = np.inf) -> NDArray[np.float32]:
     """Round pupil of ``n`` samples; ``beam`` is the 1/e^2 intensity radius in pupil radii."""
     line = (np.arange(n) - (n - 1) / 2) / (n / 2)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from sensor_frames import turbulence
 
 from escape_hw.api.sensor import SubApertureGrid
 from escape_hw.pipeline.slopes.shack_hartmann import ShackHartmannSlopes
@@ -27,18 +28,10 @@ def gaussian_pupil() -> NDArray[np.float32]:
     return np.where(r2 <= (N / 2) ** 2, np.exp(-r2 / (0.75 * N) ** 2), 0).astype(np.float32)
 
 
-def turbulence(seed: int, rms_m: float) -> NDArray[np.float32]:
-    rng = np.random.default_rng(seed)
-    f = np.fft.fftfreq(N)
-    shape = (f[:, None] ** 2 + f**2 + (1 / (4 * N)) ** 2) ** (-11 / 12)
-    opd = np.fft.ifft2(np.fft.fft2(rng.standard_normal((N, N))) * shape).real
-    return (opd * rms_m / opd.std()).astype(np.float32)
-
-
 PATHS = {
     "flat": np.zeros((N, N), np.float32),
-    "weak": turbulence(1, 50e-9),
-    "strong": turbulence(2, 700e-9),
+    "weak": turbulence(N, 50e-9, seed=1),
+    "strong": turbulence(N, 700e-9, seed=2),
 }
 
 

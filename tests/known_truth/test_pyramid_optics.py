@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from sensor_frames import turbulence
 from small_pyramid import configuration
 
 from escape_sim.oopao.library import make_pyramid, make_source, oopao_classes, suppress_output
@@ -29,14 +30,6 @@ def beam(n: int) -> NDArray[np.float32]:
     r2 = x**2 + y**2
     amplitude = np.where(r2 <= (n / 2) ** 2, np.exp(-r2 / (0.75 * n) ** 2), 0)
     return (amplitude / np.sqrt((amplitude**2).sum())).astype(np.float32)
-
-
-def turbulence(n: int, rms_m: float, seed: int = 1) -> NDArray[np.float32]:
-    rng = np.random.default_rng(seed)
-    f = np.fft.fftfreq(n)
-    shape = (f[:, None] ** 2 + f**2 + (1 / (4 * n)) ** 2) ** (-11 / 12)
-    opd = np.fft.ifft2(np.fft.fft2(rng.standard_normal((n, n))) * shape).real
-    return (opd * rms_m / opd.std()).astype(np.float32)
 
 
 def tilt(n: int, x_waves: float, y_waves: float) -> NDArray[np.float32]:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from command_line import document, escape
 from pyrtc_rig import Rig, rig, sections, within
 from small_system import SMALL
 
@@ -17,10 +17,11 @@ from escape_hw.api.procedure import run
 from escape_hw.api.results import CalibrationResult
 from escape_hw.bench import Bench
 from escape_hw.calibration.push_pull.procedure import push_pull
-from escape_hw.cli import main
 from escape_hw.config.loader import load_system
 from escape_hw.io.fits.matrix import load_matrix
 from escape_hw.io.interchange.pyrtc.calibration import FrameSettings, export_matrix
+
+__all__ = ["document", "escape"]
 
 pytestmark = [
     pytest.mark.slow,
@@ -41,16 +42,13 @@ POKE = 0.002
 
 
 @pytest.fixture
-def command(capsys: pytest.CaptureFixture[str]) -> Callable[..., dict[str, Any]]:
+def command(document: Callable[..., tuple[int, dict[str, Any], str]]) -> Callable[..., dict[str, Any]]:
     """Run ``escape`` with ``--json``, and check its exit code."""
 
     def call(*words: object, code: int = 0) -> dict[str, Any]:
-        capsys.readouterr()
-        with pytest.raises(SystemExit) as ended:
-            main([*map(str, words), "--json"])
-        out, err = capsys.readouterr()
-        assert (ended.value.code or 0) == code, err
-        return dict(json.loads(out))
+        ended, told, err = document(*words)
+        assert ended == code, err
+        return told
 
     return call
 

@@ -10,9 +10,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from running import ESCAPE
-
-NOBODY = 65534
+from running import ESCAPE, NOBODY, words_of_other_user
 
 
 @pytest.fixture(scope="module")
@@ -25,14 +23,9 @@ def homes(tmp_path_factory) -> dict[str, str]:
 @pytest.fixture(scope="module")
 def other_user() -> tuple[str, ...]:
     """Words that run a command without privileges; skips where that user cannot read the package."""
-    if os.getuid() != 0:
-        return ()
-    if shutil.which("setpriv") is None:
-        pytest.skip("needs setpriv to become another user")
-    words = ("setpriv", f"--reuid={NOBODY}", f"--regid={NOBODY}", "--clear-groups")
-    probe = [*words, sys.executable, "-c", "import escape_hw.cli, escape_sim, escape_drivers"]
-    if subprocess.run(probe, capture_output=True, check=False, cwd="/").returncode:
-        pytest.skip(f"user {NOBODY} cannot read the installed package")
+    words = words_of_other_user()
+    if words is None:
+        pytest.skip(f"needs setpriv, and an installed package that user {NOBODY} can read")
     return words
 
 

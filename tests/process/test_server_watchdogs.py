@@ -10,17 +10,14 @@ from typing import Any
 import numpy as np
 import pytest
 from serving import Spy, serving, until_idle, wait_for
-from small_system import configuration
+from stand_in_bench import REGION, simulated_bench
 
 from escape_hw.errors import RequestRefused
 from escape_hw.remote.client import Connection
 from escape_hw.remote.state import Finish, Phase
-from escape_sim.devices.twins import shared_bench
-from escape_sim.stand_ins import LIBRARIES, StandInUnavailable, bench_server, build_library
+from escape_sim.stand_ins import bench_server
 from escape_sim.stand_ins.bench_server import StandInBenchServer
 
-#: On the increments of the real camera.
-REGION = "devices.wfs.region=[216,152,208,208]"
 #: Short enough for a test, and long enough for a machine whose processors all have other work; the loop's own
 #: patience with a camera ends after five seconds.
 LIMITS = {
@@ -32,15 +29,7 @@ LIMITS = {
 @pytest.fixture(scope="module")
 def mirror() -> Iterator[tuple[StandInBenchServer, Spy]]:
     """The simulated bench, in this process, and what its mirror really does."""
-    try:
-        for name in LIBRARIES:
-            build_library(name)
-    except StandInUnavailable as reason:
-        pytest.skip(str(reason))
-    server = StandInBenchServer(configuration(REGION))
-    spy = Spy(shared_bench(server.config, server.shared))
-    with server:
-        yield server, spy
+    yield from simulated_bench(REGION)
 
 
 @pytest.fixture(scope="module")

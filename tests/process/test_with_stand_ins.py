@@ -12,21 +12,12 @@ from pathlib import Path
 
 import pytest
 from running import ESCAPE
-
-from escape_sim.stand_ins import LIBRARIES, StandInUnavailable, build_library
-
-#: On the increments of the real camera.
-REGION = "devices.wfs.region=[216,152,208,208]"
+from stand_in_bench import REGION, require_libraries
 
 
 @pytest.fixture(autouse=True)
 def _compiled() -> None:
-    """Skip where there is no compiler, and report it."""
-    try:
-        for name in LIBRARIES:
-            build_library(name)
-    except StandInUnavailable as reason:
-        pytest.skip(str(reason))
+    require_libraries()
 
 
 @pytest.mark.slow

@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from escape_benchmarks.real_time.ring_camera import POLLS, RingCamera, wait_for_change
 from escape_hw.api.camera import CameraInfo, CameraSettings, Region
 from escape_hw.errors import DeviceLost, FrameTimeout, SettingRejected
 from escape_hw.pipeline.control.integrator import LeakyIntegrator
@@ -26,7 +27,6 @@ from escape_hw.safety.limits import MirrorLimits, neighbour_pairs
 from escape_hw.streams import realtime
 from escape_hw.streams.realtime import realtime_thread
 from escape_hw.streams.ring import RingReader, RingWriter
-from escape_hw.streams.ring_camera import POLLS, RingCamera, wait_for_change
 from escape_hw.streams.segments import segment_name
 
 

@@ -97,6 +97,7 @@ def test_a_single_good_loop_is_not_shortlisted_before_a_good_neighbourhood():
         records.append(TrialRecord(Slot(EXPLORE, "A", number), {"gain": float(gain)}, {}, float(merit)))
     lucky = TrialRecord(Slot(EXPLORE, "A", 999), {"gain": 0.02}, {}, 0.9)
     found = shortlist([*records, lucky], space, "A", 4)
+    assert len(found) == 4
     assert all(abs(one["gain"] - 0.6) < 0.15 for one in found)
 
 

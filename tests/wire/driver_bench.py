@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import threading
+import time
+from collections.abc import Callable
 from functools import cache
 from typing import Any
 
@@ -10,6 +13,7 @@ import pytest
 from escape_hw.config.loader import load_system
 from escape_hw.config.registry import DeviceContext, device_factory
 from escape_hw.config.system import SystemConfig
+from escape_hw.errors import DeviceError, NotOpen
 from escape_sim.stand_ins import StandIn, StandInUnavailable
 
 #: Driver, key in [devices] and stand-in.
@@ -48,3 +52,24 @@ def make(driver: str, *more: str, system: str = "razor-shwfs") -> Any:
     config, key = configuration_of(driver, *more, system=system), PARTS[driver][0]
     section = getattr(config.devices, key)
     return device_factory(driver, hardware=True)(section, DeviceContext(key, config))
+
+
+def end_wait(camera: Any, call: Callable[[], object]) -> None:
+    """Call what ends another thread's wait for a frame long before its time-out."""
+    outcome: list[BaseException] = []
+
+    def wait() -> None:
+        try:
+            camera.next_frame(60.0)
+        except DeviceError as error:
+            outcome.append(error)
+
+    waiter = threading.Thread(target=wait)
+    waiter.start()
+    time.sleep(0.12)
+    began = time.monotonic()
+    call()
+    waiter.join(10)
+    assert time.monotonic() - began < 5
+    assert not waiter.is_alive()
+    assert isinstance(outcome[0], NotOpen)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ctypes
 import os
-import threading
 import time
 from contextlib import nullcontext
 from dataclasses import replace
@@ -13,12 +12,12 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from driver_bench import fresh, make, stand_in
+from driver_bench import end_wait, fresh, make, stand_in
 
 from escape_drivers.aravis import AravisCamera
 from escape_drivers.aravis.library import ARAVIS, AravisLibrary, ReceivedBuffer
 from escape_hw.api.camera import Region
-from escape_hw.errors import ConfigError, DeviceError, DeviceLost, FrameTimeout, NotOpen, SettingRejected
+from escape_hw.errors import ConfigError, DeviceError, DeviceLost, FrameTimeout, SettingRejected
 from escape_hw.testing import Check, Factory, parametrize_device_checks
 
 OPENING = [
@@ -240,21 +239,7 @@ def test_a_silent_camera_is_asked_whether_it_is_there(arv) -> None:
 def test_a_long_time_out_never_outlasts_close(arv) -> None:
     arv.script("arv_stream_timeout_pop_buffer 1.. timeout 1")
     camera = make("aravis").open()
-    outcome: list[BaseException] = []
-
-    def wait() -> None:
-        try:
-            camera.next_frame(60.0)
-        except DeviceError as error:
-            outcome.append(error)
-
-    waiter = threading.Thread(target=wait)
-    waiter.start()
-    time.sleep(0.1)
-    camera.close()
-    waiter.join(10)
-    assert not waiter.is_alive()
-    assert isinstance(outcome[0], NotOpen)
+    end_wait(camera, camera.close)
     assert not arv.violations
 
 

@@ -178,9 +178,7 @@ def test_numbers_on_the_wire_are_those_of_the_hardware() -> None:
 def test_acknowledgements_bring_positions_and_times() -> None:
     with emulator() as made, driver(port_of(made)) as mirror:
         shape = 0.02 * _enabled(mirror)
-        mirror.send(shape)
-        ack = mirror._ack
-        assert ack is not None
+        ack = mirror._link.command(shape * mirror.info.stroke_m)
         assert ack.result is m.Result.APPLIED
         assert 0 < ack.received_ns <= ack.applied_ns
         wait_for(lambda: bool(np.allclose(mirror.measured_positions(), shape, atol=3e-3)), "it moved")

@@ -2,41 +2,29 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from command_line import document, escape
 from small_system import SMALL
 from streams import published
 
 from escape_hw.api.procedure import run
 from escape_hw.bench import Bench
 from escape_hw.calibration.push_pull.procedure import push_pull
-from escape_hw.cli import main
 from escape_hw.config.loader import load_system
 from escape_hw.io.fits.matrix import load_matrix, save_matrix
 from escape_hw.io.fits.telemetry import load_telemetry
 from escape_hw.io.interchange.milk.stream import MilkStream
 from escape_hw.io.provenance import Provenance
 
+__all__ = ["document", "escape"]
+
 SETS = [word for one in SMALL for word in ("--set", one)]
-Command = Callable[..., tuple[int, dict[str, Any]]]
-
-
-@pytest.fixture
-def command(capsys: pytest.CaptureFixture[str]) -> Command:
-    """Run ``escape`` with ``--json``; exit code and document."""
-
-    def call(*words: object) -> tuple[int, dict[str, Any]]:
-        capsys.readouterr()
-        with pytest.raises(SystemExit) as ended:
-            main([*map(str, words), "--json"])
-        return int(ended.value.code or 0), json.loads(capsys.readouterr().out)
-
-    return call
+Command = Callable[..., tuple[int, dict[str, Any], str]]
 
 
 @pytest.fixture(scope="module")
@@ -51,9 +39,9 @@ def im(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return save_matrix(folder / "im.fits", result, Provenance(config.to_toml(), "kl"))
 
 
-def test_a_recorded_loop_goes_to_aot_and_back(tmp_path: Path, im: Path, command: Command) -> None:
+def test_a_recorded_loop_goes_to_aot_and_back(tmp_path: Path, im: Path, document: Command) -> None:
     pytest.importorskip("aotpy", reason="needs aotpy: pip install 'escape-hw[interchange]'")
-    code, told = command(
+    code, told, _ = document(
         "loop", "razor-shwfs", "--im", im, "--frames", 300, "--record", 200, "--no-strehl",
         "--out", tmp_path / "loop", *SETS,
     )  # fmt: skip
@@ -65,26 +53,26 @@ def test_a_recorded_loop_goes_to_aot_and_back(tmp_path: Path, im: Path, command:
     assert np.abs(record.commands).max() > 1e-3
     assert not np.array_equal(record.commands[-1], np.zeros(37)), "the flat shape after the end is no answer"
     aot = tmp_path / "run.fits"
-    code, told = command("export", "aot", im, "--telemetry", told["products"]["telemetry"], "--out", aot)
+    code, told, _ = document("export", "aot", im, "--telemetry", told["products"]["telemetry"], "--out", aot)
     assert code == 0, told
     back, moves = tmp_path / "back.fits", tmp_path / "moves.fits"
-    code, told = command("import", "aot", aot, "razor-shwfs", "--out", back, "--telemetry", moves, *SETS)
+    code, told, _ = document("import", "aot", aot, "razor-shwfs", "--out", back, "--telemetry", moves, *SETS)
     assert code == 0, told
     np.testing.assert_array_equal(load_matrix(back).matrix.data, load_matrix(im).matrix.data)
     np.testing.assert_array_equal(load_telemetry(moves).result.slopes, record.slopes)
     np.testing.assert_allclose(load_telemetry(moves).result.commands, record.commands, atol=1e-15)
-    code, told = command("show", moves)
+    code, told, _ = document("show", moves)
     assert (code, told["frames"]) == (0, 200)
-    code, told = command("import", "aot", aot, "razor-shwfs", "--out", back)
+    code, told, _ = document("import", "aot", aot, "razor-shwfs", "--out", back)
     assert code == 2
     assert "has 37 actuators, that of system 'razor-shwfs' 97" in told["error"]["message"]
 
 
 def test_a_matrix_goes_to_milk_and_streams_come_back(
-    tmp_path: Path, im: Path, command: Command, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, im: Path, document: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("MILK_SHM_DIR", str(tmp_path))
-    code, told = command("export", "milk", im, "razor")
+    code, told, _ = document("export", "milk", im, "razor")
     assert code == 0, told
     result = load_matrix(im).result
     wfs, dm = MilkStream.open("razor_wfs"), MilkStream.open("razor_dm")
@@ -95,18 +83,18 @@ def test_a_matrix_goes_to_milk_and_streams_come_back(
     wfs.close()
     dm.close()
     np.save(tmp_path / "array.npy", np.arange(6, dtype=np.float32).reshape(2, 3))
-    assert command("export", "milk", tmp_path / "array.npy", "little")[0] == 0
+    assert document("export", "milk", tmp_path / "array.npy", "little")[0] == 0
     stream = MilkStream.open("little")
     with published(stream, lambda number: np.full((2, 3), number)):
-        code, told = command("import", "milk", "little", "--frames", 5, "--out", tmp_path / "little.npz")
+        code, told, _ = document("import", "milk", "little", "--frames", 5, "--out", tmp_path / "little.npz")
     stream.close()
     assert code == 0, told
     with np.load(tmp_path / "little.npz") as found:
         assert (np.diff(found["count"]) >= 1).all()
         assert told["missed"] == np.ptp(found["count"]) + 1 - 5
         np.testing.assert_array_equal(found["data"][1:, 0, 0], found["count"][1:] - 1)
-    code, told = command("import", "milk", "nobody", "--out", tmp_path / "x.npz")
+    code, told, _ = document("import", "milk", "nobody", "--out", tmp_path / "x.npz")
     assert code == 2
     assert "MILK_SHM_DIR" in told["error"]["message"]
     np.save(tmp_path / "text.npy", np.array(["a"]))
-    assert command("export", "milk", tmp_path / "text.npy", "words")[0] == 2
+    assert document("export", "milk", tmp_path / "text.npy", "words")[0] == 2

@@ -9,7 +9,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from driver_bench import fresh, make, stand_in
+from driver_bench import end_wait, fresh, make, stand_in
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -305,23 +305,7 @@ def test_a_camera_that_was_reset_has_stopped_already(xi, caplog) -> None:
 def test_a_long_time_out_never_outlasts_close(xi, call) -> None:
     xi.script("set trigger_hz 0")
     camera = make("ximea", "devices.wfs.options.trigger=rising").open()
-    outcome: list[BaseException] = []
-
-    def wait() -> None:
-        try:
-            camera.next_frame(60.0)
-        except DeviceError as error:
-            outcome.append(error)
-
-    waiter = threading.Thread(target=wait)
-    waiter.start()
-    time.sleep(0.12)
-    began = time.monotonic()
-    getattr(camera, call)()
-    waiter.join(10)
-    assert time.monotonic() - began < 5
-    assert not waiter.is_alive()
-    assert isinstance(outcome[0], NotOpen)
+    end_wait(camera, getattr(camera, call))
     camera.close()
     assert not xi.violations, "neither stopped nor closed while xiGetImage was waiting"
 

@@ -46,7 +46,7 @@ def _row(system: str, frames: int) -> BenchmarkRow:
     from escape_hw.runtime.sweep.workers import LocalWorkers
 
     with tempfile.TemporaryDirectory() as folder:
-        task = _task(system, frames, Path(folder))
+        task = _task(system, Path(folder))
         values = {"gain": 0.4, "leak": 0.01, "dropped_modes": 14}
         workers = {count: LocalWorkers(count) for count in (1, 2)}
         reference_pools = {count: ProcessPoolExecutor(count, get_context("spawn")) for count in (1, 2)}
@@ -95,7 +95,7 @@ def _reference_work() -> float:
     return total
 
 
-def _task(system: str, frames: int, folder: Path) -> tuple[str, str, str, str]:
+def _task(system: str, folder: Path) -> tuple[str, str, str, str]:
     """Configuration, matrix, its checksum, and model PSF."""
     from escape_hw.api.procedure import run as run_procedure
     from escape_hw.calibration.push_pull.procedure import push_pull

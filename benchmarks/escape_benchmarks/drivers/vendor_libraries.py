@@ -31,14 +31,14 @@ def run() -> list[BenchmarkRow]:
         return [BenchmarkRow("drivers", 0.0, None, "C library", "us", "lower", str(reason))]
 
 
-def _device(driver: str, key: str, library: StandIn) -> Any:
+def _device(key: str, library: StandIn) -> Any:
     chosen = f'devices.{key}.options.library="{library.path}"'
     config = load_system("razor-shwfs", mode="hardware", overrides=[chosen])
     return build_device(key, config, Device)  # type: ignore[type-abstract]
 
 
 def _mirror(asdk: StandIn) -> list[BenchmarkRow]:
-    with _device("alpao", "dm", asdk) as dm:
+    with _device("dm", asdk) as dm:
         values = np.linspace(-0.1, 0.1, 97)
         values.setflags(write=False)
         handle, pointer = dm.handle, ctypes.c_void_p(values.ctypes.data)
@@ -65,7 +65,7 @@ def _camera(m3api: StandIn) -> list[BenchmarkRow]:
     rows = []
     for dim, what in ((1, "no pixel saturated"), (0, "some saturated")):
         m3api.clear(record=False).script(f"set real_time 0; set attenuation {dim}")
-        with _device("ximea", "wfs", m3api) as camera:
+        with _device("wfs", m3api) as camera:
             rows.append(_frame(m3api, camera, what))
     return rows
 

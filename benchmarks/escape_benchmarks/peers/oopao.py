@@ -90,12 +90,6 @@ class OopaoPeer:
 
     name = f"OOPAO {version('OOPAO')}: SPRINT"
 
-    @property
-    def valid(self) -> NDArray[np.bool_]:
-        """Its valid sub-apertures ``(n_sub, n_sub)``."""
-        sensor = self._parts.wfs
-        return np.asarray(sensor.valid_subapertures if self._sign > 0 else sensor.validI4Q, dtype=bool)
-
     def matrix(
         self, registration: Registration, real: MirrorUnderTest, *, both_ways: bool = True
     ) -> NDArray[np.float64]:

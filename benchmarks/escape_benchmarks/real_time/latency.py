@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from escape_benchmarks.peers.pyrtcao import NOT_INSTALLED, import_pyrtc, peer_name
 from escape_benchmarks.real_time.pipeline import spots
+from escape_benchmarks.real_time.ring_camera import RingCamera
 from escape_hw.api.benchmark import BenchmarkRow
 from escape_hw.api.callbacks import Callbacks
 from escape_hw.api.camera import CameraInfo, CameraSettings, Frame, Region
@@ -33,7 +34,6 @@ from escape_hw.pipeline.slopes.shack_hartmann import ShackHartmannSlopes
 from escape_hw.safety.limits import MirrorLimits
 from escape_hw.streams.realtime import realtime_thread
 from escape_hw.streams.ring import RingWriter
-from escape_hw.streams.ring_camera import RingCamera
 from escape_hw.streams.segments import segment_name
 
 #: Every rule of the guard is on.

@@ -12,26 +12,15 @@ import math
 import numpy as np
 from matplotlib.axes import Axes
 from numpy.typing import NDArray
-from scipy import special
 
 from escape_benchmarks.realisation_tables import study_parser
 from escape_hw.report.figures import style
 from escape_sim.atmosphere.layers import TurbulentLayer
-from escape_sim.atmosphere.von_karman import TurbulenceSource
+from escape_sim.atmosphere.von_karman import TurbulenceSource, structure_function
 
 PIXEL_M, R0_M, N, SIZE = 0.1, 0.15, 64, 512
 LIT = np.ones((N, N), bool)
 SEEDS = 400
-
-
-def structure_function(r_m: NDArray[np.float64], outer_scale_m: float) -> NDArray[np.float64]:
-    """Conan (2000) in rad^2; Kolmogorov's for an infinite outer scale."""
-    if math.isinf(outer_scale_m):
-        return np.asarray(6.88 * (r_m / R0_M) ** (5 / 3))
-    x = 2 * np.pi * r_m / outer_scale_m
-    c = (24 / 5 * special.gamma(6 / 5)) ** (5 / 6) * special.gamma(11 / 6) * 2 ** (1 / 6) / np.pi ** (8 / 3)
-    inner = special.gamma(5 / 6) / 2 ** (1 / 6) - x ** (5 / 6) * special.kv(5 / 6, x)
-    return np.asarray(c * (outer_scale_m / R0_M) ** (5 / 3) * inner)
 
 
 def phase(layer: TurbulentLayer, time_s: float) -> NDArray[np.float64]:
@@ -54,7 +43,7 @@ def draw_structure(axes: Axes) -> None:
             layer = TurbulentLayer(source, 1.0, (7.3, 3.1), 3.0, LIT, own)
             p = phase(layer, 0.1 * seed)
             found.append([((p[:, k:] - p[:, : N - k]) ** 2).mean() for k in pixels])
-        want = structure_function(pixels * PIXEL_M, math.inf if outer == 1e9 else outer)
+        want = structure_function(pixels * PIXEL_M, R0_M, math.inf if outer == 1e9 else outer)
         ratio, error = np.mean(found, axis=0) / want, np.std(found, axis=0) / math.sqrt(SEEDS) / want
         axes.errorbar(pixels * PIXEL_M, ratio, error, color=colour, label=label, marker="o", ms=3, lw=1)
     axes.axhline(1, color=style.MUTED, lw=0.8)

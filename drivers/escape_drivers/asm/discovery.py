@@ -9,7 +9,7 @@ from escape_drivers.asm.codec import AsmCodec
 from escape_drivers.asm.link import AsmLink
 from escape_drivers.asm.options import DEFAULT_PORT
 from escape_drivers.common.discovery import HOST_TIMEOUT_S, probe_hosts
-from escape_hw.api.discovery import DiscoveredDevice
+from escape_hw.api.discovery import DiscoveredDevice, device_section_toml
 
 
 def discover(hosts: Sequence[str]) -> list[DiscoveredDevice]:
@@ -29,9 +29,8 @@ def _probe(where: str, host: str, port: int) -> DiscoveredDevice:
 
 
 def _make_entry(host: str, port: int, welcome: m.Welcome, health: m.HealthReport) -> DiscoveredDevice:
-    toml = (
-        f'[devices.dm]\nmode = "hardware"\ndriver = "asm"\nserial = "{welcome.serial}"\n\n'
-        f'[devices.dm.options]\nhost = "{host}"\nport = {port}\n\n'
+    toml = device_section_toml("dm", "asm", welcome.serial) + (
+        f'\n\n[devices.dm.options]\nhost = "{host}"\nport = {port}\n\n'
         f"[devices.dm.limits]\ndisabled = {list(welcome.disabled)}"
     )
     model = f"{welcome.last_command_m.size} actuators, {health.state}" + (", emulated" * welcome.simulated)

@@ -62,8 +62,6 @@ class AsmLink:
         self.last_reply_s = 0.0
         #: Reason for the missing connection.
         self.reason = "it was never connected"
-        #: Late answers to requests that have timed out.
-        self.late_replies = 0
 
     @property
     def is_up(self) -> bool:
@@ -164,7 +162,7 @@ class AsmLink:
         return found
 
     def _find_reply(self, expected: int, replies: list[m.Reply]) -> m.Reply | None:
-        """The answer among what came; news go to the listener, late answers are counted."""
+        """The answer among what came; news go to the listener, late answers are logged."""
         answer: m.Reply | None = None
         for reply in replies:
             if reply.echo == expected and answer is None:
@@ -172,7 +170,6 @@ class AsmLink:
             elif reply.echo == 0:
                 self._on_unsolicited_reply(reply)
             else:
-                self.late_replies += 1
                 log.warning(
                     "%s: an answer to request %d came while %d was due", self.name, reply.echo, expected
                 )
@@ -209,6 +206,5 @@ def _configure_socket(sock: socket.socket) -> None:
     """Disable Nagle's algorithm and enable keep-alive, which detects a peer that disappeared."""
     sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-    for option, value in (("TCP_KEEPIDLE", 1), ("TCP_KEEPINTVL", 1), ("TCP_KEEPCNT", 3)):
-        if hasattr(socket, option):
-            sock.setsockopt(socket.IPPROTO_TCP, getattr(socket, option), value)
+    for option, value in ((socket.TCP_KEEPIDLE, 1), (socket.TCP_KEEPINTVL, 1), (socket.TCP_KEEPCNT, 3)):
+        sock.setsockopt(socket.IPPROTO_TCP, option, value)

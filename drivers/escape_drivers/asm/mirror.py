@@ -205,12 +205,11 @@ class AsmMirror(AdaptiveSecondary):
         self._info = self._expected.info(model, self._expected.serial, simulated=False) if layout else None
         self._metres, self._stroke_m = np.empty(0), math.nan
         self._heartbeat: BackgroundThread | None = None
-        self._ack: m.Ack | None = None
         self._last_state, self._fault_text = ShellState.OFF, ""
         self._initial_shape: NDArray[np.float64] | None = None
         self._last_attempt_s = 0.0
         self._last_warning = ""
-        self._consecutive_skips = self._skipped = 0
+        self._consecutive_skips = 0
 
     @classmethod
     def from_section(cls, section: MirrorConfig, context: DeviceContext) -> Self:
@@ -375,7 +374,7 @@ class AsmMirror(AdaptiveSecondary):
             raise DeviceError(
                 self.name, f"reported {ack.positions.size} positions for {self._metres.size} actuators"
             )
-        self._ack, self._last_state = ack, ack.state
+        self._last_state = ack.state
         return ack.state
 
     def _known_state(self) -> ShellState:
@@ -443,7 +442,6 @@ class AsmMirror(AdaptiveSecondary):
                 "some were disabled, "
                 "or its limits became tighter; open it again to see what to configure",
             )
-        self._skipped += 1
         self._consecutive_skips += 1
         if self._consecutive_skips >= self._options.max_skips:
             raise DeviceError(

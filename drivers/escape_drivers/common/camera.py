@@ -172,7 +172,7 @@ class BlockingCamera(Camera, Generic[C]):
 
     def __init__(self, name: str, setup: CameraSetup, kind: str, counter: tuple[int, int]) -> None:
         super().__init__(name)
-        self._setup, self._kind = setup, kind
+        self._setup = setup
         self._sensor_px = setup.sensor_px
         self._settings = setup.settings(self._sensor_px)
         self._info, self._is_stand_in = self._build_info(kind, stand_in=False), False

@@ -47,7 +47,7 @@ class LoadedLibrary:
     #: Errors after which the device must be opened again.
     LOST_CODES: ClassVar[frozenset[int]] = frozenset()
 
-    def __init__(self, device: str, path: str = "") -> None:
+    def __init__(self, device: str, path: str) -> None:
         self.device = device
         vendor = self.VENDOR
         try:

@@ -8,10 +8,19 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from escape_drivers.pi import wave_table as pi_circle
 from escape_drivers.pi.controller import E727
 from escape_drivers.pi.travel import AxisTravel
-from escape_drivers.pi.wave_table import CycleTiming
+from escape_drivers.pi.wave_table import (
+    MAX_POINTWISE,
+    CycleTiming,
+    circle_targets,
+    evaluate_sine_table,
+    fit_phasors,
+    fit_sine_table,
+    nearest_timing,
+    response_from_row,
+    response_to_row,
+)
 from escape_hw.api.modulator import Modulation
 from escape_hw.errors import DeviceError, SettingRejected
 
@@ -79,22 +88,17 @@ class CircleGenerator:
         return achieved
 
     def _timing(self, modulation: Modulation) -> CycleTiming:
-        return pi_circle.nearest_timing(modulation.frequency_hz, self._travel.servo_s, self._stage.max_points)
+        return nearest_timing(modulation.frequency_hz, self._travel.servo_s, self._stage.max_points)
 
     def _waves(
         self, modulation: Modulation, turn: CycleTiming, response: AxisResponse
     ) -> NDArray[np.float64]:
         """Targets of both axes ``(points, 2)`` in the controller's unit, within its limits."""
-        tilt = pi_circle.circle_targets(turn, response) * modulation.radius_rad + np.array(
-            modulation.centre_rad
-        )
+        tilt = circle_targets(turn, response) * modulation.radius_rad + np.array(modulation.centre_rad)
         waves = self._travel.positions(tilt)
-        if turn.points > pi_circle.MAX_POINTWISE:
+        if turn.points > MAX_POINTWISE:
             # What the controller draws itself has its phase to a point only.
-            sine_tables = [
-                pi_circle.evaluate_sine_table(turn, pi_circle.fit_sine_table(turn, waves[:, axis]))
-                for axis in (0, 1)
-            ]
+            sine_tables = [evaluate_sine_table(turn, fit_sine_table(turn, waves[:, axis])) for axis in (0, 1)]
             waves = np.stack(sine_tables, axis=1)
         lower, upper = self._travel.lower, self._travel.upper
         if (waves < lower).any() or (waves > upper).any():
@@ -161,10 +165,10 @@ class CircleGenerator:
             )
 
     def _write_table(self, table: int, turn: CycleTiming, wave: NDArray[np.float64]) -> None:
-        if turn.points <= pi_circle.MAX_POINTWISE:
+        if turn.points <= MAX_POINTWISE:
             self._controller.write_points(table, wave)
         else:
-            self._controller.write_sine(table, turn, pi_circle.fit_sine_table(turn, wave))
+            self._controller.write_sine(table, turn, fit_sine_table(turn, wave))
         held = self._controller.table(table, turn.points)
         worst = float(np.abs(held - wave).max())
         if worst > _TABLE_TOLERANCE * float(np.max(self._travel.upper - self._travel.lower)):
@@ -189,7 +193,7 @@ class CircleGenerator:
                 f"frequency_hz is {frequency:.6g}, and stage.corrections has rows "
                 f"for {available} Hz only; 'recorder' measures others",
             )
-        return pi_circle.response_from_row(near[0]) if near else (1 + 0j, 1 + 0j)
+        return response_from_row(near[0]) if near else (1 + 0j, 1 + 0j)
 
     def _is_measurable(self, modulation: Modulation) -> bool:
         """Whether the circle is checked with the recorder."""
@@ -199,7 +203,7 @@ class CircleGenerator:
     def _measure(self, modulation: Modulation, turn: CycleTiming) -> AxisResponse:
         """Amplitude and phase of both axes relative to their targets."""
         self._sleep(max(_SETTLING_S, 1 / modulation.frequency_hz))
-        found, _ = pi_circle.fit_phasors(*self._record(turn))
+        found, _ = fit_phasors(*self._record(turn))
         if (np.abs(found[2:]) == 0).any():
             raise DeviceError(
                 self._name, "recorded targets that do not move; see DRC? for the recorder's options"
@@ -224,7 +228,7 @@ class CircleGenerator:
         if frequency >= _SLOWEST_HZ:
             # The motion of the axes, not the command in the tables.
             records, samples_per_turn = self._record(turn)
-        found, means = pi_circle.fit_phasors(records[:, :2], samples_per_turn)
+        found, means = fit_phasors(records[:, :2], samples_per_turn)
         centre = self._travel.tilts(means)
         radii = np.abs(found * self._travel.gain) * self._travel.unit_rad
         return Modulation(float(radii.mean()), frequency, (float(centre[0]), float(centre[1])))
@@ -233,6 +237,6 @@ class CircleGenerator:
         """What was measured, as rows of ``stage.corrections``."""
         rows = []
         for servo_periods, response in sorted(self._responses.items()):
-            words = pi_circle.response_to_row(1 / (servo_periods * self._travel.servo_s), response)
+            words = response_to_row(1 / (servo_periods * self._travel.servo_s), response)
             rows.append([float(f"{value:.5g}") for value in words])
         return rows

@@ -135,7 +135,7 @@ class E727:
     def move_and_wait(
         self, positions: NDArray[np.float64], longest_s: float, sleep: Callable[[float], None]
     ) -> None:
-        """Move both axes and wait until they are there; ``DeviceError`` after ``longest_s`` seconds."""
+        """Move both axes to ``positions (2,)`` in its unit and wait; ``DeviceError`` after ``longest_s``."""
         self.set_targets([float(place) for place in positions])
         deadline = time.monotonic() + longest_s
         while not self.on_target():
@@ -186,7 +186,7 @@ class E727:
 
     # ------------------------------------------------------------------ waves
     def write_points(self, table: int, points: NDArray[np.float64]) -> None:
-        """A wave table point by point, in as many lines as it takes."""
+        """A wave table point by point ``(n,)``, in the unit of the axis, in as many lines as it takes."""
         for first in range(0, len(points), _POINTS_PER_LINE):
             chunk = [float(value) for value in points[first : first + _POINTS_PER_LINE]]
             how = "&" if first else "X"

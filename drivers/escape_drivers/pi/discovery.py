@@ -11,7 +11,7 @@ from escape_drivers.common.discovery import HOST_TIMEOUT_S, probe_hosts
 from escape_drivers.pi.controller import E727
 from escape_drivers.pi.link import GcsLink
 from escape_drivers.pi.transports import TcpTransport
-from escape_hw.api.discovery import DiscoveredDevice
+from escape_hw.api.discovery import DiscoveredDevice, device_section_toml
 
 #: Port that a controller listens on unless the host is given with another.
 DEFAULT_PORT = 50000
@@ -32,10 +32,8 @@ def _probe(where: str, host: str, port: int) -> DiscoveredDevice:
 
 
 def _make_entry(host: str, port: int, controller: E727) -> DiscoveredDevice:
-    toml = (
-        f'[devices.modulator]\nmode = "hardware"\ndriver = "pi-e727"\nserial = "{controller.serial}"\n\n'
-        f'[devices.modulator.wire]\nkind = "tcp"\nhost = "{host}"\nport = {port}'
-    )
+    toml = device_section_toml("modulator", "pi-e727", controller.serial)
+    toml += f'\n\n[devices.modulator.wire]\nkind = "tcp"\nhost = "{host}"\nport = {port}'
     return DiscoveredDevice(
         "modulator", controller.model, controller.serial, f"{host}:{port}", "pi-e727", (), toml
     )

@@ -116,10 +116,9 @@ class EstimatorThread:
             self._thread.join()
 
     def _process_blocks(self) -> None:
-        if hasattr(os, "setpriority"):
-            # A thread id is accepted here on Linux only.
-            with contextlib.suppress(OSError):
-                os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE_INCREMENT)
+        with contextlib.suppress(OSError):
+            # Linux accepts a thread id here.
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE_INCREMENT)
         while (block := self._filled_blocks.get()) is not None:
             index, rows, filled = block
             try:

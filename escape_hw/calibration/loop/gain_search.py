@@ -70,8 +70,8 @@ def find_best_gain(
     frames
         Frames per gain.
     model_psf
-        PSF without turbulence. With it gains are compared by the Strehl ratio of the peak, else by the
-        residual.
+        PSF without turbulence ``(rows, columns)``. With it gains are compared by the Strehl ratio of the
+        peak, else by the residual.
 
     Returns
     -------

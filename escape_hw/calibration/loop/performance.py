@@ -50,7 +50,7 @@ def close_loop(
     frames
         Number of frames.
     model_psf
-        PSF without turbulence. With it and a science camera the Strehl ratios are measured.
+        PSF without turbulence ``(rows, columns)``. With it and a science camera Strehl ratios are measured.
     stage
         Name of the stage in progress reports.
 

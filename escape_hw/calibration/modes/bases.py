@@ -52,7 +52,7 @@ def _pupil_surfaces(surfaces: NDArray[np.float64], pupil: NDArray[np.bool_]) -> 
 
 
 def fix_signs(m2c: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Flip modes so that the largest coefficient of each, the first one of equals, is positive."""
+    """Flip modes ``(n_act, n_modes)`` so that the largest coefficient, the first of equals, is positive."""
     size = np.abs(m2c)
     pivot = np.argmax(size >= size.max(axis=0) * (1 - 1e-6), axis=0)
     return np.asarray(m2c * np.sign(m2c[pivot, np.arange(m2c.shape[1])]))
@@ -190,6 +190,8 @@ def zernike(surfaces: NDArray[np.float64], pupil: NDArray[np.bool_], n_modes: in
 
 def fourier(surfaces: NDArray[np.float64], pupil: NDArray[np.bool_], n_modes: int) -> NDArray[np.float64]:
     """Tip, tilt, then cosines and sines of whole cycles across the pupil's diameter, lowest frequency first.
+
+    ``surfaces``, ``pupil``, ``n_modes`` and the result as for :func:`karhunen_loeve`.
 
     Raises
     ------

@@ -12,6 +12,7 @@ from escape_hw.cli import options
 from escape_hw.cli.command import CommandGroup, command
 from escape_hw.cli.context import CommandContext
 from escape_hw.cli.options import SystemSelection
+from escape_hw.paper.frame_counts import FRAMES, PAIRED_LOOP_FRAMES, SEEDS
 
 app = typer.Typer(
     help="The paper's tables and figures in simulation, with a report.",
@@ -33,8 +34,8 @@ _DocrimeFrames = Annotated[int, typer.Option("--frames", min=1, help="Frames of 
 def shwfs(
     context: CommandContext,
     selection: _System = _SHWFS,
-    frames: _DocrimeFrames = 10_000,
-    loop_frames: _LoopFrames = 30_000,
+    frames: _DocrimeFrames = FRAMES["shwfs"]["frames"],
+    loop_frames: _LoopFrames = FRAMES["shwfs"]["loop_frames"],
     realisations: Annotated[
         int,
         typer.Option("--realisations", min=0, help="Random registrations for the curve of error and frames."),
@@ -53,11 +54,11 @@ def pywfs(
     selection: _System = _PYWFS,
     frames: Annotated[
         int, typer.Option("--frames", min=1, help="Frames of the open-loop DO-CRIME.")
-    ] = 100_000,
+    ] = FRAMES["pywfs"]["frames"],
     closed_frames: Annotated[
         int, typer.Option("--closed-frames", min=1, help="Frames of each round in closed loop, at most.")
-    ] = 20_000,
-    loop_frames: _LoopFrames = 20_000,
+    ] = FRAMES["pywfs"]["closed_frames"],
+    loop_frames: _LoopFrames = FRAMES["pywfs"]["loop_frames"],
     out: options.Out = None,
 ) -> None:
     """Matrices, optical gains and loops with and without them, on the pyramid bench."""
@@ -70,8 +71,8 @@ def pywfs(
 def maps(
     context: CommandContext,
     selection: _System = _MAPS,
-    frames: _DocrimeFrames = 60_000,
-    loop_frames: _LoopFrames = 10_000,
+    frames: _DocrimeFrames = FRAMES["maps"]["frames"],
+    loop_frames: _LoopFrames = FRAMES["maps"]["loop_frames"],
     out: options.Out = None,
 ) -> None:
     """Measured matrix beside its simulation, and loops on the sky, with a contaminated mirror."""
@@ -84,10 +85,10 @@ def maps(
 def revolt(
     context: CommandContext,
     selection: _System = _REVOLT,
-    short: _ShortFrames = 2500,
-    long: _LongFrames = 10_000,
-    loop_frames: _LoopFrames = 600,
-    seeds: Annotated[int, typer.Option("--seeds", min=2, help="Twins, from --seed on.")] = 5,
+    short: _ShortFrames = FRAMES["revolt"]["short"],
+    long: _LongFrames = FRAMES["revolt"]["long"],
+    loop_frames: _LoopFrames = PAIRED_LOOP_FRAMES,
+    seeds: Annotated[int, typer.Option("--seeds", min=2, help="Twins, from --seed on.")] = SEEDS,
     out: options.Out = None,
 ) -> None:
     """Registration on the sky, and loops with three matrices on equal turbulence, over several twins."""
@@ -104,8 +105,8 @@ def revolt(
 def table1(
     context: CommandContext,
     selection: _System = _SHWFS,
-    short: _ShortFrames = 10_000,
-    long: _LongFrames = 100_000,
+    short: _ShortFrames = FRAMES["table1"]["short"],
+    long: _LongFrames = FRAMES["table1"]["long"],
     out: options.Out = None,
 ) -> None:
     """Registration from 20 seconds and from 3 minutes of data (paper, Table 1)."""

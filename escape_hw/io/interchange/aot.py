@@ -317,7 +317,7 @@ def read_aot(path: Path | str, stroke_m: float | None = None, loop: str = "") ->
             warnings.simplefilter("ignore")
             system = aotpy.AOSystem.read_from_file(path)
     except FileNotFoundError as error:
-        raise ProductError(f"{path}: cannot be read ({error.strerror})") from error
+        raise ProductError(f"{path}: cannot be read ({error.strerror or error})") from error
     except Exception as error:
         raise ProductError(
             f"{path}: not an AOT file that aotpy reads ({type(error).__name__}: {error})"

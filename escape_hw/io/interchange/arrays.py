@@ -23,7 +23,7 @@ from escape_hw.api.pyramid import PyramidPupils
 from escape_hw.api.results import CalibrationResult
 from escape_hw.api.sensor import SensorGeometry, SubApertureGrid
 from escape_hw.array_files import array_names, read_array
-from escape_hw.bounded_files import MAX_TEXT_BYTES, read_bounded
+from escape_hw.bounded_files import MAX_TEXT_BYTES, read_bounded, reason_of
 from escape_hw.errors import ConfigError, IncompatibleProduct
 from escape_hw.suggestions import closest_match, did_you_mean
 
@@ -189,8 +189,7 @@ def read_description(path: Path) -> ArrayDescription:
         lines = [f"{path}  {'.'.join(map(str, one['loc']))}: {_problem(one)}" for one in details]
         raise ConfigError("\n".join(lines)) from error
     except (OSError, ValueError) as error:
-        reason = error.strerror if isinstance(error, OSError) and error.strerror else error
-        raise ConfigError(f"{path}: cannot be read ({reason})") from error
+        raise ConfigError(f"{path}: cannot be read ({reason_of(error)})") from error
 
 
 def _problem(detail: ErrorDetails) -> str:

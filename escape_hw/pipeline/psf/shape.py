@@ -105,7 +105,7 @@ def _half_maximum_diameters(
 
 
 def encircled_energy(
-    clean: NDArray[np.floating], centre: tuple[float, float], total: float | None = None
+    clean: NDArray[np.floating], centre: tuple[float, float]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Share of the light within a circle, by radius.
 
@@ -115,8 +115,6 @@ def encircled_energy(
         Image without background ``(rows, columns)``.
     centre
         Centre of the circles (row, column).
-    total
-        Light of the whole source; by default that of the image.
 
     Returns
     -------
@@ -134,7 +132,7 @@ def encircled_energy(
     ring = np.minimum(np.ceil(4 * distance), n).astype(np.intp)
     light = np.repeat(np.repeat(clean, _SUBPIXELS, 0), _SUBPIXELS, 1) / _SUBPIXELS**2
     sums = np.bincount(ring.ravel(), weights=light.ravel(), minlength=n + 1)[:n]
-    whole = float(clean.sum()) if total is None else total
+    whole = float(clean.sum())
     return np.arange(n) / 4, np.cumsum(sums) / whole if whole else np.zeros(n)
 
 

@@ -44,7 +44,7 @@ def diffraction_psf(
 
 
 def subtract_background(image: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Image minus the median of its border."""
+    """Image ``(rows, columns)`` minus the median of its border."""
     return np.asarray(image - np.median(image[_border_mask(image.shape)]), dtype=np.float64)
 
 
@@ -56,7 +56,10 @@ def _border_mask(shape: tuple[int, ...]) -> NDArray[np.bool_]:
 
 
 def has_light(image: NDArray[np.floating]) -> bool:
-    """Whether the brightest pixel exceeds the background by ten times the scatter of the border."""
+    """Whether the brightest pixel of an image ``(rows, columns)`` exceeds the median of its border.
+
+    By more than ten times the scatter of the border.
+    """
     rim = image[_border_mask(image.shape)]
     # The brightest of the 16,384 pixels of a dark image exceeds it by about four times the scatter.
     return bool(np.max(image) - np.median(rim) > 10 * np.std(rim))
@@ -116,7 +119,7 @@ def _shift_image(image: NDArray[np.float64], shift: NDArray[np.float64]) -> NDAr
 
 
 def compute_encircled_energy(image: NDArray[np.float64], radius_px: float = RADIUS_PX) -> float:
-    """Fraction of a centred image's light within ``radius_px`` of its middle."""
+    """Light within ``radius_px`` pixels of the middle of a centred image ``(rows, columns)`` of unit sum."""
     return float((image * _aperture(image.shape, radius_px)).sum())
 
 

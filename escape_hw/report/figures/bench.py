@@ -211,12 +211,8 @@ def mirror_without_grid(command: NDArray[np.float64], places_m: NDArray[np.float
     """
     values = 100 * np.asarray(command, float)
     figure, axes, limit = _mirror_axes(values)
-    distance = np.hypot(*(places_m[:, None, k] - places_m[:, k] for k in (0, 1)))
-    np.fill_diagonal(distance, np.inf)
-    radius = 0.5 * float(np.median(distance.min(axis=1))) if len(places_m) > 1 else 1.0
-    spots = PatchCollection([Circle((x, y), radius) for x, y in places_m], linewidths=0)
-    spots.set_facecolor([tuple(c) for c in style.map_colours(values, style.DIVERGING, -limit, limit)])
-    axes.add_collection(spots)
+    actuators, radius = style.discs(places_m, style.map_colours(values, style.DIVERGING, -limit, limit))
+    axes.add_collection(actuators)
     reach = float(np.abs(places_m).max(initial=0.0)) + radius
     axes.set(xlim=(-reach, reach), ylim=(reach, -reach), aspect="equal")
     return figure

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.collections import PatchCollection
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle
 from numpy.typing import NDArray
 
 from escape_hw.api.results import GoodnessOfFit, find_outliers
@@ -71,15 +69,11 @@ def _draw_map(
     axes: Axes, rms: NDArray[np.float64], places: NDArray[np.float64], limit: float, kind: str
 ) -> None:
     """Draw values at their places ``(n, 2)`` as (x, y), rows downwards; outliers with a border."""
-    distance = np.hypot(*(places[:, None, k] - places[:, k] for k in (0, 1)))
-    np.fill_diagonal(distance, np.inf)
-    radius = 0.5 * float(np.median(distance.min(axis=1))) if len(places) > 1 else 0.5
     width = np.zeros(rms.size)
     width[find_outliers(rms)] = 1.6
-    spots = PatchCollection([Circle((x, y), radius) for x, y in places], linewidths=width)
     # An actuator out of service has no residual, which is not a good fit.
     judged = np.where(rms > 0, rms, np.nan)
-    spots.set_facecolor([tuple(c) for c in style.map_colours(judged, _MAP, 0.0, limit)])
+    spots, radius = style.discs(places, style.map_colours(judged, _MAP, 0.0, limit), width)
     spots.set_edgecolor(style.SERIES[5])
     style.hide_axes(axes).add_collection(spots)
     low, high = places.min(axis=0) - 1.2 * radius, places.max(axis=0) + 1.2 * radius

@@ -12,8 +12,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
+from matplotlib.collections import PatchCollection
 from matplotlib.colors import Colormap, Normalize
 from matplotlib.figure import Figure, FigureBase
+from matplotlib.patches import Circle
 from numpy.typing import NDArray
 
 # Figures are made without pyplot: no global state, no windows, safe in any thread.
@@ -84,6 +86,18 @@ def map_colours(
     if hidden is not None:
         rgba[hidden] = 0
     return rgba
+
+
+def discs(
+    places: NDArray[np.float64], colours: NDArray[np.float64], border: NDArray[np.float64] | float = 0.0
+) -> tuple[PatchCollection, float]:
+    """Discs at places ``(n, 2)`` in colours ``(n, 4)``, and their radius: half the distance of neighbours."""
+    distance = np.hypot(*(places[:, None, k] - places[:, k] for k in (0, 1)))
+    np.fill_diagonal(distance, np.inf)
+    radius = 0.5 * float(np.median(distance.min(axis=1))) if len(places) > 1 else 0.5
+    drawn = PatchCollection([Circle((x, y), radius) for x, y in places], linewidths=border)
+    drawn.set_facecolor([tuple(c) for c in colours])
+    return drawn, radius
 
 
 def colour_bar(

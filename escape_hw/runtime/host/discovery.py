@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import cast
 
-from escape_hw.api.discovery import DiscoveredDevice, Discoverer
+from escape_hw.api.discovery import DiscoveredDevice, Discoverer, device_section_toml
 from escape_hw.runtime.host.computer import Host, UsbDevice
 
 GROUP = "escape.discover"
@@ -61,11 +61,6 @@ def _describe(
         kind, model or f"{device.vendor}:{device.product}", device.serial, path, driver,
         tuple(host.users_of(path)), device_section_toml(section, driver, device.serial) + more,
     )  # fmt: skip
-
-
-def device_section_toml(section: str, driver: str, serial: str) -> str:
-    """Lines of a device's section."""
-    return f'[devices.{section}]\nmode = "hardware"\ndriver = "{driver}"\nserial = "{serial}"'
 
 
 def _find_alpao(host: Host) -> Iterator[DiscoveredDevice]:

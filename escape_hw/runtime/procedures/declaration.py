@@ -7,7 +7,6 @@ from these classes. Importing a declaration loads no numerical library: heavy im
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping
@@ -30,6 +29,7 @@ from typing import (
 from escape_hw.config.renamed import present_value
 from escape_hw.deprecation import renamed_text, warn_renamed
 from escape_hw.errors import ConfigError
+from escape_hw.suggestions import closest_match
 
 if TYPE_CHECKING:
     from escape_hw.api.procedure import Procedure
@@ -394,7 +394,7 @@ def check_arguments(
 
 
 def _unknown_message(name: str, known: Iterable[str], label: Callable[[str], str]) -> str:
-    near = difflib.get_close_matches(name, list(known), 1)
+    near = closest_match(name, known)
     names = ", ".join(map(label, known)) or "none"
-    hint = f"did you mean '{label(near[0])}'?" if near else f"there are {names}"
+    hint = f"did you mean '{label(near)}'?" if near else f"there are {names}"
     return f"'{label(name)}' is no argument of this procedure; {hint}"

@@ -178,7 +178,9 @@ def read_description(folder: Path, storage: str | None = None) -> SweepDescripti
         url = document["storage"] if storage is None else storage
         found = SweepDescription(sweep, url, document["study"], document["sampler"], document["margin"])
     except OSError as error:
-        raise ProductError(f"{path}: cannot be read ({error.strerror}); is {folder} a sweep?") from error
+        raise ProductError(
+            f"{path}: cannot be read ({error.strerror or error}); is {folder} a sweep?"
+        ) from error
     except (ValueError, KeyError, TypeError) as error:
         raise ProductError(f"{path}: damaged ({error})") from error
     if ":***@" in found.storage:

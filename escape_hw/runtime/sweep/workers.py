@@ -140,15 +140,15 @@ class DaskWorkers(Workers):
     ConfigError
         Dask is not installed.
     CalibrationError
-        No scheduler answers within ``timeout_s`` seconds.
+        No scheduler answers within :data:`SCHEDULER_TIMEOUT_S` seconds.
     """
 
-    def __init__(self, address: str, timeout_s: float = SCHEDULER_TIMEOUT_S) -> None:
+    def __init__(self, address: str) -> None:
         try:
             dask: Any = importlib.import_module("distributed")
         except ImportError:
             raise ConfigError("--scheduler needs Dask's distributed: pip install 'escape-hw[dask]'") from None
-        self.address, self._timeout_s, self._dask = address, timeout_s, dask
+        self.address, self._dask = address, dask
         self._lost_errors = (
             CancelledError, dask.KilledWorker, dask.comm.CommClosedError, dask.client.ClosedClientError,
             dask.client.FutureCancelledError,
@@ -165,7 +165,7 @@ class DaskWorkers(Workers):
             return 1
 
     def _open_executor(self) -> Executor:
-        deadline = time.monotonic() + self._timeout_s
+        deadline = time.monotonic() + SCHEDULER_TIMEOUT_S
         while True:
             try:
                 self._client = self._dask.Client(self.address, timeout=5, set_as_default=False)
@@ -174,8 +174,8 @@ class DaskWorkers(Workers):
             except (OSError, TimeoutError) as error:
                 if self._closed or time.monotonic() > deadline:
                     raise CalibrationError(
-                        f"no Dask scheduler answers at {self.address} for {self._timeout_s:.0f} s; start one "
-                        "(dask scheduler) and workers (dask worker --nthreads 1), then resume"
+                        f"no Dask scheduler answers at {self.address} for {SCHEDULER_TIMEOUT_S:.0f} s; start "
+                        "one (dask scheduler) and workers (dask worker --nthreads 1), then resume"
                     ) from error
                 log.warning("no Dask scheduler at %s; trying again", self.address)
                 time.sleep(1.0)

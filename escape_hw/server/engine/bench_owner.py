@@ -7,14 +7,19 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Mapping
+from functools import cached_property
 from queue import Empty, SimpleQueue
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from escape_hw.api.procedure import Progress
 from escape_hw.api.sensor import SlopeFunction
 from escape_hw.bench import Bench
 from escape_hw.calibration.acquisition.frames import ramp_to
 from escape_hw.calibration.acquisition.sensor_setup import build_slope_function
+from escape_hw.calibration.modes.bases import build_modal_basis
 from escape_hw.errors import DeviceError, EscapeError, FrameTimeout
 from escape_hw.remote.state import Phase
 from escape_hw.server.engine.publisher import StreamPublisher
@@ -55,6 +60,11 @@ class BenchOwner:
         self._slopes: tuple[tuple[object, ...], SlopeFunction | None] = ((), None)
 
     # ------------------------------------------------------------ any thread
+    @cached_property
+    def modal_basis(self) -> NDArray[np.float64]:
+        """Modes to commands ``(n_act, n_modes)``."""
+        return build_modal_basis(self.bench)
+
     def post(self, job: Callable[[], object]) -> None:
         """Queue a job for the main thread."""
         self._jobs.put(job)

@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from escape_hw.api.offsets import Offsets
-from escape_hw.calibration.modes.bases import build_modal_basis
 from escape_hw.calibration.modes.low_orders import combine_low_orders
 from escape_hw.errors import CommandRejected, EscapeError, IncompatibleProduct, ProductError, RequestRefused
 from escape_hw.io.fits.offsets import load_offsets, save_offsets
@@ -39,7 +38,6 @@ class OffsetControl:
     def __init__(self, owner: BenchOwner, runs: Path) -> None:
         self._owner, self._bench = owner, owner.bench
         self._folder = runs / "offsets" / owner.bench.config.system.name
-        self._m2c: NDArray[np.float64] | None = None
         self.offsets = Offsets()
         self.saved: tuple[str, ...] = ()
         self._list_saved()
@@ -93,11 +91,6 @@ class OffsetControl:
             self._owner.state.check_idle()
 
     # ------------------------------------------------------------ parts
-    def _basis(self) -> NDArray[np.float64]:
-        if self._m2c is None:
-            self._m2c = build_modal_basis(self._bench)
-        return self._m2c
-
     def _modes(self, terms: dict[str, float]) -> NDArray[np.float64]:
         if not terms:
             return np.zeros(0)
@@ -105,12 +98,12 @@ class OffsetControl:
         if not np.isfinite(info.stroke_m):
             raise RequestRefused("offsets in nanometres need the stroke of the mirror (devices.dm.stroke_m)")
         # Reflection doubles the surface; modes have unit rms surface.
-        return combine_low_orders(terms, self._basis(), info.positions_m, 2e9 * info.stroke_m)
+        return combine_low_orders(terms, self._owner.modal_basis, info.positions_m, 2e9 * info.stroke_m)
 
     def _present_flat(self) -> NDArray[np.float64]:
         """The present shape without the terms."""
         shape, modes = self._bench.dm.shape, self.offsets.modes
-        return shape - self._basis() @ modes if modes.size else shape
+        return shape - self._owner.modal_basis @ modes if modes.size else shape
 
     def _apply_with_references(self, new: Offsets, reply: Reply) -> None:
         """Average the present slopes, and apply them; in a thread of its own."""
@@ -151,9 +144,9 @@ class OffsetControl:
         dm, control = self._bench.dm, self._owner.state.snapshot.loop_control
         flat = np.zeros(dm.info.n_act) if not new.flat.size else new.flat.copy()
         if new.modes.size:
-            if new.modes.size != self._basis().shape[1]:
+            if new.modes.size != self._owner.modal_basis.shape[1]:
                 raise IncompatibleProduct(f"the offsets are of {new.modes.size} modes, not of this basis")
-            flat += self._basis() @ new.modes
+            flat += self._owner.modal_basis @ new.modes
         if control is not None:
             # Before anything changes: the matrix of the loop may not fit.
             control.request_change(offsets=new)

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from escape_hw.api.concurrency import SignalSafeFlag
 from escape_hw.api.procedure import Progress
 from escape_hw.calibration.acquisition.frames import ramp_to
-from escape_hw.calibration.modes.bases import build_modal_basis
 from escape_hw.errors import EscapeError, RequestRefused
 from escape_hw.remote.requests import PokeRequest
 from escape_hw.remote.state import PokePlan
@@ -27,7 +26,6 @@ class PokeRunner:
 
     def __init__(self, owner: BenchOwner) -> None:
         self._owner, self._bench = owner, owner.bench
-        self._m2c: NDArray[np.float64] | None = None
 
     def plan(self, request: PokeRequest) -> PokePlan:
         """What a poke would do; nothing moves (RequestRefused: there is no such actuator or mode)."""
@@ -79,12 +77,11 @@ class PokeRunner:
             if request.number in self._bench.dm.limits.disabled:
                 raise RequestRefused(f"actuator {request.number + 1} is disabled in the configuration")
             return np.eye(n_act)[request.number], f"actuator {request.number + 1}"
-        if self._m2c is None:
-            self._m2c = build_modal_basis(self._bench)
-        n_modes = self._m2c.shape[1]
+        m2c = self._owner.modal_basis
+        n_modes = m2c.shape[1]
         if request.number >= n_modes:
             raise RequestRefused(f"mode {request.number + 1}: the basis has {n_modes}")
-        mode = self._m2c[:, request.number]
+        mode = m2c[:, request.number]
         return mode / np.abs(mode).max(), f"mode {request.number + 1}"
 
     def _run(

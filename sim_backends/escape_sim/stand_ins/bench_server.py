@@ -81,11 +81,11 @@ class StandInBenchServer:
     ----------
     config
         The system; the modes of its devices are ignored.
-    shared
-        Dictionary of the opened system, through which emulators of other devices find the same bench.
 
     Attributes
     ----------
+    shared
+        Dictionary through which emulators of other devices find the same bench.
     environment
         Environment variables by which drivers find the stand-ins and this bench.
     requests
@@ -94,9 +94,9 @@ class StandInBenchServer:
         Emulated controller of the modulator, if the system has one.
     """
 
-    def __init__(self, config: SystemConfig, shared: dict[str, object] | None = None) -> None:
+    def __init__(self, config: SystemConfig) -> None:
         self.config = config
-        self.shared: dict[str, object] = {} if shared is None else shared
+        self.shared: dict[str, object] = {}
         self.environment: dict[str, str] = {}
         self.requests = dict.fromkeys(RequestKind, 0)
         # The bench has one clock; requests of its devices are processed one at a time.

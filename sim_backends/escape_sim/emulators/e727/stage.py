@@ -23,7 +23,7 @@ class Hold:
     target: float
 
     def at(self, steps: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Targets at servo steps."""
+        """Targets at servo steps ``(n,)`` in microradians."""
         return np.full(len(steps), self.target)
 
 
@@ -37,7 +37,7 @@ class Ramp:
     step_size: float
 
     def at(self, steps: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Targets at servo steps; the end is held."""
+        """Targets at servo steps ``(n,)`` in microradians; the end is held."""
         distance = np.clip((steps - self.start) * self.step_size, 0.0, abs(self.end - self.begin))
         return np.asarray(self.begin + np.copysign(distance, self.end - self.begin))
 
@@ -60,7 +60,7 @@ class Wave:
         return self.cycles > 0 and step - self.start >= self.cycles * self.rate * len(self.table)
 
     def at(self, steps: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Targets at servo steps; the last point is held at the end."""
+        """Targets at servo steps ``(n,)`` in microradians; the last point is held at the end."""
         n = len(self.table)
         along = np.maximum(steps - self.start, 0)
         if self.cycles:
@@ -102,7 +102,7 @@ class Axis:
         self.position = 0.0
 
     def advance(self, to: int) -> NDArray[np.float64]:
-        """Advance to servo step ``to``; returns measured positions of the last steps before it."""
+        """Advance to servo step ``to``; returns positions ``(n,)`` of the last steps before it [µrad]."""
         first = max(self._step, to - TRANSIENT_STEPS)
         if to <= first:
             return np.empty(0)
@@ -114,7 +114,7 @@ class Axis:
         return np.asarray(track, np.float64)
 
     def steady(self, first: int, count: int) -> NDArray[np.float64]:
-        """Measured positions of ``count`` steps from ``first`` on, without a transient."""
+        """Measured positions ``(count,)`` in microradians from step ``first`` on, without a transient."""
         targets = self.trajectory.at(np.arange(first - TRANSIENT_STEPS, first + count))
         track, _ = lfilter(*self._filter, targets, zi=self._unit_state * targets[0])
         return np.asarray(track[TRANSIENT_STEPS:], np.float64)

@@ -7,17 +7,11 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-import pytest
-from broken import broken_class
+from broken import Broken
 
 from escape_hw.api.camera import Camera
-from escape_hw.api.device import Device
 from escape_hw.errors import DeviceError, FrameTimeout
-from escape_hw.testing.checks import CHECKS
 from escape_hw.testing.reference_devices import SyntheticCamera
-
-Broken = tuple[str, type[Device], str, dict[str, Any]]
-Catches = Callable[[Callable[[], Device], str], None]
 
 
 def frames_with(**changes: Callable[[Any], Any]) -> Callable[..., Any]:
@@ -205,14 +199,3 @@ BROKEN: list[Broken] = [
     ("poll counts", SyntheticCamera, "camera_polls_without_waiting", {"poll": polls_through_next_frame}),
     ("waits for ever", SyntheticCamera, "camera_raises_timeout", {"_next_frame": waits_for_ever}),
 ]
-
-
-@pytest.mark.parametrize(
-    ("base", "expected", "defects"), [pytest.param(*case[1:], id=case[0]) for case in BROKEN]
-)
-def test_check_catches(catches: Catches, base: type[Device], expected: str, defects: dict[str, Any]) -> None:
-    catches(broken_class(base, defects), expected)
-
-
-def test_every_check_is_tested() -> None:
-    assert {check.__name__ for check in CHECKS[Camera]} == {f"check_{case[2]}" for case in BROKEN}

@@ -3,19 +3,12 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from typing import Any
 
-import pytest
-from broken import broken_class
+from broken import Broken
 
-from escape_hw.api.device import Device
 from escape_hw.errors import DeviceError, NotOpen
-from escape_hw.testing.checks import CHECKS
 from escape_hw.testing.reference_devices import IdealPhaseScreen, RecordingMirror
-
-Broken = tuple[str, type[Device], str, dict[str, Any]]
-Catches = Callable[[Callable[[], Device], str], None]
 
 
 def opens_itself(self: Any) -> None:
@@ -74,14 +67,3 @@ BROKEN: list[Broken] = [
         {"now_ns": lambda self: time.monotonic()},
     ),
 ]
-
-
-@pytest.mark.parametrize(
-    ("base", "expected", "defects"), [pytest.param(*case[1:], id=case[0]) for case in BROKEN]
-)
-def test_check_catches(catches: Catches, base: type[Device], expected: str, defects: dict[str, Any]) -> None:
-    catches(broken_class(base, defects), expected)
-
-
-def test_every_check_is_tested() -> None:
-    assert {check.__name__ for check in CHECKS[Device]} == {f"check_{case[2]}" for case in BROKEN}

@@ -3,23 +3,16 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
-import pytest
-from broken import broken_class
+from broken import Broken
 
-from escape_hw.api.device import Device
 from escape_hw.api.mirror import DeformableMirror, DMInfo, SendReport
 from escape_hw.errors import CommandRejected
 from escape_hw.safety.guard import GuardReport
-from escape_hw.testing.checks import CHECKS
 from escape_hw.testing.reference_devices import RecordingMirror
-
-Broken = tuple[str, type[Device], str, dict[str, Any]]
-Catches = Callable[[Callable[[], Device], str], None]
 
 
 def info_of(**changes: Any) -> property:
@@ -174,14 +167,3 @@ BROKEN: list[Broken] = [
     ("stays open when lost", RecordingMirror, "mirror_closes_when_lost", {"close": leaks_on_failure}),
     ("hides the cause", RecordingMirror, "mirror_closes_when_lost", {"__exit__": hides_the_cause}),
 ]
-
-
-@pytest.mark.parametrize(
-    ("base", "expected", "defects"), [pytest.param(*case[1:], id=case[0]) for case in BROKEN]
-)
-def test_check_catches(catches: Catches, base: type[Device], expected: str, defects: dict[str, Any]) -> None:
-    catches(broken_class(base, defects), expected)
-
-
-def test_every_check_is_tested() -> None:
-    assert {check.__name__ for check in CHECKS[DeformableMirror]} == {f"check_{case[2]}" for case in BROKEN}

@@ -3,22 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
-import pytest
-from broken import broken_class
+from broken import Broken
 
-from escape_hw.api.device import Device
-from escape_hw.api.modulator import ModulatorInfo, ModulatorStatus, TipTiltModulator
-from escape_hw.api.phase_screen import PhaseScreen, ScreenInfo
+from escape_hw.api.modulator import ModulatorInfo, ModulatorStatus
+from escape_hw.api.phase_screen import ScreenInfo
 from escape_hw.errors import SettingRejected
-from escape_hw.testing.checks import CHECKS
 from escape_hw.testing.reference_devices import IdealPhaseScreen, QuantisedModulator
-
-Broken = tuple[str, type[Device], str, dict[str, Any]]
-Catches = Callable[[Callable[[], Device], str], None]
 
 
 def checks_by_moving(self: Any, want: Any) -> Any:
@@ -96,16 +89,3 @@ BROKEN: list[Broken] = [
     ("answers blindly", IdealPhaseScreen, "screen_set_changes_only_given_fields", {"set": answers_blindly}),
     ("sticks", IdealPhaseScreen, "screen_reaches_every_screen", {"_set": sticks}),
 ]
-
-
-@pytest.mark.parametrize(
-    ("base", "expected", "defects"), [pytest.param(*case[1:], id=case[0]) for case in BROKEN]
-)
-def test_check_catches(catches: Catches, base: type[Device], expected: str, defects: dict[str, Any]) -> None:
-    catches(broken_class(base, defects), expected)
-
-
-def test_every_check_is_tested() -> None:
-    assert {check.__name__ for check in CHECKS[TipTiltModulator] + CHECKS[PhaseScreen]} == {
-        f"check_{case[2]}" for case in BROKEN
-    }

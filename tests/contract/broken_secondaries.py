@@ -3,22 +3,16 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
-import pytest
-from broken import broken_class
+from broken import Broken
 
 from escape_hw.api.adaptive_secondary import AdaptiveSecondary, ShellState
-from escape_hw.api.device import Device
 from escape_hw.api.mirror import DeformableMirror
 from escape_hw.errors import DeviceError
-from escape_hw.testing import mirror_checks, secondary_checks
 from escape_hw.testing.reference_devices import IdealSecondary
-
-Catches = Callable[[Callable[[], Device], str], None]
 
 
 def sticks_on_the_way_down(self: Any, state: ShellState) -> None:
@@ -79,7 +73,7 @@ def stays_afloat(self: Any) -> None:
     DeformableMirror._before_close(self)
 
 
-BROKEN: list[tuple[str, str, dict[str, Any]]] = [
+DEFECTS: list[tuple[str, str, dict[str, Any]]] = [
     ("sticks", "secondary_reaches_every_state", {"_step": sticks_on_the_way_down}),
     ("health elsewhere", "secondary_reaches_every_state", {"_health": health_of_another_state}),
     ("follows asleep", "secondary_follows_commands_only_when_running", {"send": always_follows}),
@@ -93,13 +87,4 @@ BROKEN: list[tuple[str, str, dict[str, Any]]] = [
     ("recovers always", "secondary_recovers_only_from_faults", {"recover": recovers_always}),
     ("closes afloat", "secondary_rests_when_closed", {"_before_close": stays_afloat}),
 ]
-
-
-@pytest.mark.parametrize(("expected", "defects"), [pytest.param(*case[1:], id=case[0]) for case in BROKEN])
-def test_check_catches(catches: Catches, expected: str, defects: dict[str, Any]) -> None:
-    catches(broken_class(IdealSecondary, defects), expected)
-
-
-def test_every_check_is_tested() -> None:
-    own = set(secondary_checks()) - set(mirror_checks())
-    assert {check.__name__ for check in own} == {f"check_{case[1]}" for case in BROKEN}
+BROKEN: list[Broken] = [(name, IdealSecondary, check, broken) for name, check, broken in DEFECTS]
