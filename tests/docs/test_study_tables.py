@@ -64,3 +64,13 @@ def test_the_page_of_faint_stars_has_its_tables(capsys, import_study):
         printed = capsys.readouterr().out
         assert len(tables) == printed.count("\n") - 2
         assert printed in text
+
+
+def test_the_page_of_sky_time_has_its_tables(capsys, import_study):
+    text = (ROOT / "docs" / "studies" / "sky-time.md").read_text(encoding="utf-8")
+    study = import_study("sky_time/sky_time.py")
+    tables = [read_lines(path) for path in (ROOT / "docs" / "studies" / "sky-time").glob("*.jsonl")]
+    assert tables
+    for rows in tables:
+        study.print_table([study.errors_of_line(row) for row in rows], rows[0]["asked"]["frames"])
+        assert capsys.readouterr().out in text

@@ -49,6 +49,11 @@ def measure_realisation(options: argparse.Namespace, number: int) -> Line:
     return {"commit": get_git_state(), **{name: to_json(getattr(found, name)) for name in _KEPT}}
 
 
+def errors_of_line(line: Line) -> RealisationErrors:
+    """The inverse of :func:`measure_realisation`."""
+    return RealisationErrors(*(array(line[kept]) for kept in _KEPT))
+
+
 def print_table(realisations: list[RealisationErrors], frames: list[int]) -> None:
     """Print a table."""
     print(f"| frames | | {' | '.join(f'{TITLES[name][0]} [{TITLES[name][1]}]' for name in PARAMETERS)} |")
@@ -76,7 +81,7 @@ def main() -> None:
     lines = each_realisation(
         target, asked, realisation_numbers(options), lambda number: measure_realisation(options, number)
     )
-    realisations = [RealisationErrors(*(array(line[kept]) for kept in _KEPT)) for line in lines]
+    realisations = [errors_of_line(line) for line in lines]
     curves = summary(realisations, options.frames, accuracy_goal(options.system))
     error_curves(curves).savefig(target.with_suffix(".png"), dpi=110, facecolor="white")
     print_table(realisations, options.frames)
