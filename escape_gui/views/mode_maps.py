@@ -234,7 +234,7 @@ def _error_tiles(label: str, matrix: InteractionMatrix, mode: int) -> list[MapTi
     errors, ratios = slope_map_pair(relative, matrix.valid), slope_map_pair(ratio, matrix.valid)
     note = f"1 σ, rms {root_mean_square(sigma) / rms:.2g}"
     return [
-        MapTile(f"Standard error of {label}", note, errors, (0.0, _round_up(top)), False),
+        MapTile(f"Error of {label}", note, errors, (0.0, _round_up(top)), False),
         MapTile(f"SNR of {label}", f"median {middle:.3g}", ratios, (0.0, _round_up(2 * middle)), False),
     ]
 

@@ -222,7 +222,7 @@ def test_a_click_shows_the_mode_in_every_matrix(calibrate, source, tmp_path):
     until(lambda: mosaic.mode == 4, calibrate)
     assert panel.detail.isVisible()
     assert tuple(one.title for one in panel.detail.tiles) == (
-        "push-pull", "DO-CRIME", "ESCAPE", "ESCAPE − push-pull", "Standard error of DO-CRIME",
+        "push-pull", "DO-CRIME", "ESCAPE", "ESCAPE − push-pull", "Error of DO-CRIME",
         "SNR of DO-CRIME",
     )  # fmt: skip
     assert panel._status_label.text().startswith("mode 5  rms slope")
