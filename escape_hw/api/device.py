@@ -62,6 +62,7 @@ class Device(abc.ABC):
         with self._lock:
             if self._is_open:
                 return self
+            self._before_open()
             try:
                 self._open()
             except BaseException as cause:
@@ -152,6 +153,9 @@ class Device(abc.ABC):
 
     def _after_open(self) -> None:  # noqa: B027 - an optional hook
         """Hook for the base class of a kind of device, called after ``_open``."""
+
+    def _before_open(self) -> None:  # noqa: B027 - an optional hook
+        """Hook for the base class of a kind of device, called before ``_open``: loads what takes long."""
 
     def _before_close(self) -> None:  # noqa: B027 - an optional hook
         """Hook for the base class of a kind of device, called before ``_close``: flattens a mirror."""

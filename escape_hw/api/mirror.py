@@ -15,7 +15,7 @@ from escape_hw.api.device import Device
 from escape_hw.api.representation import short_repr
 from escape_hw.deprecation import renamed_members
 from escape_hw.errors import CommandRejected, DeviceError, SettingRejected
-from escape_hw.safety.guard import CommandGuard, GuardReport
+from escape_hw.safety.guard import CommandGuard, GuardReport, load_compiled_check
 from escape_hw.safety.limits import MirrorLimits, all_pairs, nearest_pairs, neighbour_pairs
 
 
@@ -306,6 +306,9 @@ class DeformableMirror(Device):
     def _numbers_in_hardware(self, actuators: Iterable[int]) -> tuple[int, ...]:
         """Numbers in the hardware of actuators of the layout, ascending."""
         return _renumber(actuators, None if self.order is None else np.argsort(self.order))
+
+    def _before_open(self) -> None:
+        load_compiled_check()
 
     def _before_close(self) -> None:
         self.flatten()

@@ -355,6 +355,11 @@ class CommandGuard:
         return _clamp(shape, bound)
 
 
+def load_compiled_check() -> None:
+    """Load the compiled check of the limits, which may take seconds, before a mirror waits for heartbeats."""
+    CommandGuard("", 1, MirrorLimits()).is_legal(np.zeros(1))
+
+
 def _peak(values: NDArray[np.float64]) -> float:
     return float(np.abs(values).max(initial=0.0))
 

@@ -350,3 +350,16 @@ def test_valid_commands_are_sent_unchanged_and_others_are_not(values: list[float
         report = dm.send(shape)
         assert is_legal == report.guard.is_unchanged
         assert not is_legal or np.array_equal(report.sent, shape)
+
+
+def test_the_compiled_check_is_loaded_before_the_connection(monkeypatch) -> None:
+    """A mirror with a watchdog would wait for heartbeats meanwhile."""
+    order = []
+    monkeypatch.setattr("escape_hw.api.mirror.load_compiled_check", lambda: order.append("check"))
+
+    class Connecting(RecordingMirror):
+        def _open(self) -> None:
+            order.append("connection")
+
+    Connecting(4).open()
+    assert order == ["check", "connection"]

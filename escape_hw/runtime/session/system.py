@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -19,6 +20,7 @@ from escape_hw.api.tracking import TrackResult
 from escape_hw.bench import Bench
 from escape_hw.config import layouts
 from escape_hw.config.loader import load_system
+from escape_hw.errors import DeviceError
 from escape_hw.runtime.procedures.calibration import DocrimeProcedure, EscapeProcedure
 from escape_hw.runtime.procedures.declaration import ProcedureSpec
 from escape_hw.runtime.procedures.gains import GainsProcedure
@@ -39,6 +41,7 @@ if TYPE_CHECKING:
 
 
 ResultT = TypeVar("ResultT")
+log = logging.getLogger(__name__)
 
 
 class System(Bench):
@@ -80,6 +83,24 @@ class System(Bench):
         """
         if isinstance(procedure, ProcedureSpec):
             procedure = procedure.on_bench(self)
+        try:
+            result = self._run(procedure, observers, abort, progress)
+        except BaseException:
+            try:
+                self._leave_flat()
+            except DeviceError as second:
+                log.error("the mirror could NOT be made flat: %s", second)
+            raise
+        self._leave_flat()
+        return result
+
+    def _run(
+        self,
+        procedure: Procedure[ResultT],
+        observers: tuple[Observer, ...],
+        abort: StopSignal | None,
+        progress: bool,
+    ) -> ResultT:
         if not progress:
             return run_procedure(procedure, observers=observers, abort=abort)
 
@@ -88,6 +109,11 @@ class System(Bench):
 
         with ProgressView(DisplayConsole()) as view:
             return run_procedure(procedure, observers=(*observers, view), abort=abort)
+
+    def _leave_flat(self) -> None:
+        """Flatten the mirror after a procedure that did not."""
+        if self.dm.is_open and not np.array_equal(self.dm.shape, self.dm.flat):
+            self.dm.flatten()
 
     @procedure_method(ModelPsfProcedure)
     def take_model_psf(self, *, frames: int = 20, progress: bool = False) -> NDArray[np.float32]:
