@@ -103,7 +103,7 @@ def test_one_mode_in_every_matrix():
     }
     shown = {tile.title: tile for tile in tiles(matrices, 10)}
     assert list(shown) == [
-        "push-pull", "ESCAPE", "ESCAPE − push-pull", "Standard error of push-pull", "SNR of push-pull",
+        "push-pull", "ESCAPE", "ESCAPE − push-pull", "Error of push-pull", "SNR of push-pull",
     ]  # fmt: skip
     outside = ~matrices["ESCAPE"].valid
     for tile in shown.values():
