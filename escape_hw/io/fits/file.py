@@ -20,13 +20,20 @@ from astropy.utils.exceptions import AstropyWarning
 from numpy.typing import NDArray
 
 from escape_hw.bounded_files import max_product_bytes, read_bounded
-from escape_hw.errors import ProductError
+from escape_hw.errors import IncompatibleProduct, ProductError
 from escape_hw.io.provenance import Provenance, format_utc, get_git_state, get_software_version
 from escape_hw.io.storage import write_atomic
 
 #: Version of the products' layout; a higher one is refused on reading.
 SCHEMA = 1
 _BLOCK = 2880
+
+
+def expect(path: Path, what: str, found: object, wanted: object, remedy: str = "") -> None:
+    """Raise IncompatibleProduct where something that is wanted (not ``None``) differs from what was found."""
+    if wanted is not None and found != wanted:
+        out = f" ({remedy})" if remedy else ""
+        raise IncompatibleProduct(f"{path}: its {what} is {found!r}; {wanted!r} is needed{out}")
 
 
 def header_text(text: str) -> str:

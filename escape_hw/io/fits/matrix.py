@@ -138,7 +138,7 @@ def load_matrix(
         ("number of modes", matrix.n_modes, expect_modes, remedy),
         ("grid of sub-apertures", matrix.valid.shape, expect_sub_apertures, ""),
     ):
-        _expect(path, what, found, wanted, hint)
+        fits_file.expect(path, what, found, wanted, hint)
     if expect_m2c is not None:
         _expect_basis(path, matrix.m2c, np.asarray(expect_m2c, float))
     if matrix.simulated and not allow_simulated:
@@ -209,14 +209,8 @@ def _unpack(path: Path, hdus: astropy_fits.HDUList, header: dict[str, Any]) -> C
     )
 
 
-def _expect(path: Path, what: str, found: object, wanted: object, remedy: str = "") -> None:
-    if wanted is not None and found != wanted:
-        out = f" ({remedy})" if remedy else ""
-        raise IncompatibleProduct(f"{path}: its {what} is {found!r}; {wanted!r} is needed{out}")
-
-
 def _expect_basis(path: Path, found: NDArray[np.float64], wanted: NDArray[np.float64]) -> None:
-    _expect(path, "shape of the basis", found.shape, wanted.shape)
+    fits_file.expect(path, "shape of the basis", found.shape, wanted.shape)
     worst = float(np.abs(found - wanted).max(initial=0.0))
     if worst > 1e-9 * max(1.0, float(np.abs(wanted).max(initial=0.0))):
         raise IncompatibleProduct(

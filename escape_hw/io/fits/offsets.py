@@ -53,10 +53,9 @@ def load_offsets(
         Sound, but of another system, or simulated.
     """
     product = OffsetsProduct.read(path, KIND_OFFSETS, _unpack)
-    system, simulated = product.header.get("SYSTEM"), product.header.get("SIMULATE", True)
-    if expect_system is not None and system != fits_file.header_text(expect_system):
-        raise IncompatibleProduct(f"{path}: its system is {system!r}; {expect_system!r} is needed")
-    if simulated and not allow_simulated:
+    wanted = None if expect_system is None else fits_file.header_text(expect_system)
+    fits_file.expect(product.path, "system", product.header.get("SYSTEM"), wanted)
+    if product.header.get("SIMULATE", True) and not allow_simulated:
         raise IncompatibleProduct(f"{path}: made in simulation; it is not for hardware")
     return product
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import time
 from collections.abc import Callable
@@ -79,8 +78,10 @@ class ProgressView:
             log.info("progress is no longer shown: %s: %s", type(error).__name__, error)
             bars, self._bars = self._bars, None
             if bars is not None:
-                with contextlib.suppress(Exception, SystemExit):
+                try:
                     bars.stop()
+                except (Exception, SystemExit) as second:
+                    log.info("its display did not end cleanly: %s: %s", type(second).__name__, second)
 
     def _close(self, succeeded: bool) -> None:
         if self._notebook is not None and succeeded:

@@ -169,7 +169,7 @@ class BenchOwner:
         """Release the fault and open the devices again."""
         self.state.clear_fault()
         with contextlib.suppress(EscapeError):
-            # A device that does not close cleanly now was the fault itself.
+            # A device that does not close cleanly now was the fault itself; the bench has logged it.
             self.bench.close()
         self.open()
 
