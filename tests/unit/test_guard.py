@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from numpy.typing import NDArray
 
-from escape_hw.safety.guard import CommandGuard
+from escape_hw.safety.guard import CommandGuard, load_compiled_check
 from escape_hw.safety.limits import MirrorLimits
 
 positive = st.floats(1e-4, 2.0)
@@ -115,3 +115,23 @@ def test_from_an_illegal_shape_each_command_comes_nearer(
             break
     if limits.max_slew is None or limits.max_slew > 0.05:
         assert static_breaches(limits, safe) == []
+
+
+def test_what_is_loaded_is_what_a_guard_with_every_rule_calls(monkeypatch) -> None:
+    called = []
+
+    def record(*arguments) -> bool:
+        called.append(
+            [
+                (a.dtype, a.ndim, a.flags.writeable) if isinstance(a, np.ndarray) else type(a)
+                for a in arguments
+            ]
+        )
+        return True
+
+    monkeypatch.setattr("escape_hw.safety.compiled_check.obeys_limits", record)
+    load_compiled_check()
+    limits = MirrorLimits(max_stroke=0.5, max_slew=0.2, max_neighbour=0.4, max_mean=0.1, max_abs_sum=5.0)
+    CommandGuard("dm", N, limits, PAIRS).limit(np.full(N, 0.01))
+    assert len(called) >= 2
+    assert all(one == called[0] for one in called)
