@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 from dataclasses import replace
 
@@ -11,8 +12,8 @@ from small_bench import assert_flat, small
 
 from escape_hw.api.procedure import run as run_procedure
 from escape_hw.calibration.acquisition.checkpoint import Checkpoint
-from escape_hw.errors import Aborted, IncompatibleProduct, ProductError
-from escape_hw.io.fits.run_state import load_state
+from escape_hw.errors import Aborted, IncompatibleProduct, ProductError, StorageError
+from escape_hw.io.fits.run_state import load_state, save_state
 from escape_hw.runtime.procedures.calibration import calibrate_with_method
 
 #: States now and then; the last is that of the moment it was interrupted.
@@ -80,6 +81,31 @@ def test_interrupted_and_resumed_it_equals_the_uninterrupted_run(good, tmp_path,
     gain = np.vdot(resumed.matrix.data, whole.matrix.data) / np.vdot(whole.matrix.data, whole.matrix.data)
     assert gain == pytest.approx(1, abs=0.05)
     assert resumed.grid.motion_px == pytest.approx(whole.grid.motion_px, rel=0.2)
+
+
+@pytest.mark.parametrize("stop", [False, True])
+def test_a_state_that_cannot_be_saved_is_logged_once_and_the_run_goes_on(
+    good, tmp_path, monkeypatch, caplog, stop
+):
+    path, full = tmp_path / "run.state", StorageError("the disk is full")
+
+    def fail_after_the_first(*arguments):
+        if path.exists():
+            raise full
+        return save_state(*arguments)
+
+    monkeypatch.setattr("escape_hw.calibration.acquisition.checkpoint.save_state", fail_after_the_first)
+    monkeypatch.setattr("escape_hw.api.procedure.Reporter.PERIOD_S", 0.0)
+    often = ("calibration.checkpoint_s=0.01",)
+    if stop:
+        with pytest.raises(Aborted) as caught:
+            measure(good, "push-pull", path, more=often)
+        assert caught.value.partial.partial
+    else:
+        assert not measure(good, "push-pull", path, stop=False, more=often).partial
+    (warning,) = [one for one in caplog.records if one.levelno == logging.WARNING]
+    assert "the run goes on: the disk is full" in warning.getMessage()
+    assert load_state(path).values["request"] == {}
 
 
 @pytest.fixture(scope="module")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import logging
 import math
 import time
 import tomllib
@@ -18,8 +19,10 @@ from escape_hw.api.sensor import SensorGeometry
 from escape_hw.bench import Bench
 from escape_hw.config.renamed import update_document
 from escape_hw.config.system import SystemConfig
-from escape_hw.errors import IncompatibleProduct
+from escape_hw.errors import IncompatibleProduct, StorageError
 from escape_hw.io.fits.run_state import RunState, load_state, save_state
+
+log = logging.getLogger(__name__)
 
 #: Differing configuration keys that an error message names.
 _MAX_LISTED = 5
@@ -45,6 +48,7 @@ class Checkpoint:
         self._next_save = self._period_s = math.inf
         self._identity: Mapping[str, Any] = {}
         self._bench: Bench | None = None
+        self._is_failing = False
 
     def begin(
         self, bench: Bench, method: str, m2c: NDArray[np.float64], settings: Mapping[str, Any]
@@ -99,18 +103,18 @@ class Checkpoint:
     def save(
         self, values: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]], grid: SensorGeometry | None
     ) -> None:
-        """Save a state.
-
-        Raises
-        ------
-        StorageError
-            It cannot be written; the previous one stays.
-        """
+        """Save a state; one that cannot be written is logged, the previous one stays, and the run goes on."""
         if self._bench is None:
             raise RuntimeError("a checkpoint was saved before its run began")
         values = {**values, "request": self._request, "rng": self._bench.rng.bit_generator.state}
         state = RunState(self._identity, values, arrays, grid)
-        save_state(self.path, state, self._bench.config.system.name, self._bench.simulated)
+        try:
+            save_state(self.path, state, self._bench.config.system.name, self._bench.simulated)
+            self._is_failing = False
+        except StorageError as error:
+            if not self._is_failing:
+                log.warning("the state of the run cannot be saved, and the run goes on: %s", error)
+            self._is_failing = True
         self._next_save = time.monotonic() + self._period_s
 
     def remove(self) -> None:
