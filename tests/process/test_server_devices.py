@@ -171,7 +171,9 @@ def test_offsets_move_the_mirror_at_rest_and_are_saved_and_restored(bench: Conne
     assert focus.any()
     bench.flatten()
     assert np.array_equal(bench.latest("commands").data, focus), "flat includes the offsets"
-    assert bench.save_offsets("night 1").saved == ("night-1",)
+    with pytest.raises(RequestRefused, match="such as 'night-1'"):
+        bench.save_offsets("night 1")
+    assert bench.save_offsets("night-1").saved == ("night-1",)
     bench.set_offsets({})
     assert not bench.latest("commands").data.any()
     assert bench.load_offsets("night-1").terms == state.terms

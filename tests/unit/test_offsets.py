@@ -13,7 +13,7 @@ import pytest
 
 from escape_hw.api.offsets import Offsets
 from escape_hw.calibration.modes.low_orders import combine_low_orders
-from escape_hw.errors import ConfigError, IncompatibleProduct, ProductError
+from escape_hw.errors import ConfigError, IncompatibleProduct, ProductError, RequestRefused
 from escape_hw.io.fits.offsets import load_offsets, save_offsets
 from escape_hw.remote.requests import OffsetsRequest
 from escape_hw.server.engine.offsets import OffsetControl
@@ -90,8 +90,8 @@ def test_offsets_are_saved_and_restored(tmp_path: Path) -> None:
         load_offsets(path)
 
 
-def load_saved(runs: Path, simulated: bool) -> tuple[OffsetControl, dict[str, float]]:
-    """Load the offsets 'x' in the engine of the system 'small'; returns its control and the terms."""
+def offset_control(runs: Path, simulated: bool) -> OffsetControl:
+    """The offsets in the engine of the system 'small'."""
     config = SimpleNamespace(system=SimpleNamespace(name="small"))
     dm = SimpleNamespace(is_open=True, info=SimpleNamespace(n_act=4), set_flat=lambda flat: None)
     state = SimpleNamespace(loop_control=None, active_run=None, fault=None)
@@ -100,8 +100,13 @@ def load_saved(runs: Path, simulated: bool) -> tuple[OffsetControl, dict[str, fl
         state=SimpleNamespace(snapshot=state, check_idle=lambda: None),
         post=lambda job: None,
     )
-    control = OffsetControl(owner, runs)
-    request = OffsetsRequest(verb="load_offsets", client="0" * 8, name="x")
+    return OffsetControl(owner, runs)
+
+
+def load_saved(runs: Path, simulated: bool, name: str = "x") -> tuple[OffsetControl, dict[str, float]]:
+    """Load the offsets of a name in the engine of the system 'small'; returns its control and the terms."""
+    control = offset_control(runs, simulated)
+    request = OffsetsRequest(verb="load_offsets", client="0" * 8, name=name)
     control.handle(request, lambda state, error: None)
     return control, dict(control.offsets.terms)
 
@@ -116,6 +121,26 @@ def test_saved_offsets_of_another_system_or_of_a_simulation_are_refused(tmp_path
     save_offsets(path, Offsets({"tip": 1.0}), "large", False, fake.ORIGIN)
     with pytest.raises(IncompatibleProduct, match="its system is 'large'"):
         load_saved(tmp_path, simulated=False)
+
+
+@pytest.mark.parametrize("verb", ["save_offsets", "load_offsets"])
+@pytest.mark.parametrize(("name", "possible"), [("a b", "a-b"), ("../a", "..-a"), ("a/b", "a-b")])
+def test_a_name_that_no_file_has_is_refused_with_one_that_a_file_can_have(
+    tmp_path: Path, verb: str, name: str, possible: str
+) -> None:
+    control = offset_control(tmp_path, simulated=True)
+    request: Any = SimpleNamespace(verb=verb, name=name)
+    with pytest.raises(RequestRefused, match=f"offsets '{name}': .* such as '{possible}'"):
+        control.handle(request, lambda state, error: None)
+    assert not list(tmp_path.rglob("*.fits"))
+
+
+def test_offsets_are_loaded_by_the_name_that_is_listed(tmp_path: Path) -> None:
+    path = tmp_path / "offsets" / "small" / "a b.fits"
+    path.parent.mkdir(parents=True)
+    save_offsets(path, Offsets({"tip": 1.0}), "small", True, fake.ORIGIN)
+    control, terms = load_saved(tmp_path, simulated=True, name="a b")
+    assert (control.saved, terms) == (("a b",), {"tip": 1.0})
 
 
 def test_offsets_saved_by_earlier_versions_are_found_by_their_system(tmp_path: Path) -> None:

@@ -175,24 +175,28 @@ class OffsetControl:
         self._owner.post(flatten)
 
     def _save(self, name: str) -> None:
-        bench = self._bench
-        record = BenchRecord.from_bench(bench)
+        path, record = self._path(name), BenchRecord.from_bench(self._bench)
         self._folder.mkdir(parents=True, exist_ok=True)
-        save_offsets(self._path(name), self.offsets, record.system, record.simulated, record.origin())
+        save_offsets(path, self.offsets, record.system, record.simulated, record.origin())
         log.info("offsets saved as '%s'", name)
         self._list_saved()
 
     def _load(self, name: str) -> Offsets:
-        path = self._path(name)
         product = load_offsets(
-            self._find_saved().get(path.stem, path),
+            self._find_saved().get(name) or self._path(name),
             expect_system=self._folder.name,
             allow_simulated=self._bench.simulated,
         )
         return product.result
 
     def _path(self, name: str) -> Path:
-        return self._folder / (re.sub(r"[^\w.+-]", "-", name) + ".fits")
+        """File of a name; a name that no file has is refused, since two of them would share one file."""
+        possible = re.sub(r"[^\w.+-]", "-", name)
+        if name != possible:
+            raise RequestRefused(
+                f"offsets '{name}': a name has letters, digits and . _ + - only, such as '{possible}'"
+            )
+        return self._folder / f"{name}.fits"
 
     def _list_saved(self) -> None:
         try:
