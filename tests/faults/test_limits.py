@@ -11,6 +11,7 @@ from escape_hw.calibration.modes.bases import build_modal_basis
 from escape_hw.calibration.push_pull.procedure import push_pull
 from escape_hw.calibration.sprint.fit import sprint
 from escape_hw.errors import CalibrationError, ConfigError, ProductError
+from escape_hw.runtime.procedures.calibration import calibrate_with_method
 
 LIMITS = {
     "stroke": "devices.dm.limits.max_stroke=0.05",
@@ -47,6 +48,26 @@ def test_docrime_with_shortened_pokes(good, name):
     estimate = sprint(matrix, good.model, modes=20, covariance=run.solution.covariance)
     assert estimate.converged, estimate.warnings
     assert np.abs((estimate.registration.to_array() - INJECTED) / estimate.sigma).max() < 4
+
+
+@pytest.mark.parametrize(
+    ("method", "frames", "closed_loop"),
+    [
+        ("docrime", 130, False), ("docrime", 130, True), ("push-pull", 1, False), ("modulated", 100, False),
+        pytest.param("escape", 40, False, marks=pytest.mark.slow),
+        pytest.param("escape", 40, True, marks=pytest.mark.slow),
+    ],
+)  # fmt: skip
+def test_the_poke_in_the_result_is_the_largest_that_was_applied(good, method, frames, closed_loop):
+    with small("twin.loss_probability=0", "calibration.poke_command=0.02") as bench:
+        largest = 0.02 / np.abs(build_modal_basis(bench)).max(axis=0).min()
+        bench.screen.set(inserted=method != "push-pull")
+        options = {"closed_loop": good.run.result} if closed_loop else {"grid": good.grid}
+        result = bench.run(calibrate_with_method(bench, method, frames=frames, poke=0.9, **options))
+    assert result.matrix.metrics["poke"] == pytest.approx(largest)
+    assert f"no mode was poked with 0.9, {largest:.3g} at most: calibration.poke_command, 0.02," in " ".join(
+        result.notes
+    )
 
 
 def pushed(good, *limits):

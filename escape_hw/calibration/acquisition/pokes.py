@@ -122,6 +122,18 @@ def compute_poke_amplitudes(bench: Bench, m2c: NDArray[np.float64], poke: float)
     return np.asarray(np.minimum(poke, _max_amplitudes(bench, m2c)))
 
 
+def note_limited_poke(bench: Bench, amplitude: NDArray[np.float64], poke: float) -> list[str]:
+    """Note for the operator if no mode is poked with the ``poke`` that was requested."""
+    largest = float(amplitude.max())
+    if largest >= poke:
+        return []
+    command = bench.config.calibration.poke_command
+    return [
+        f"no mode was poked with {poke:g}, {largest:.3g} at most: calibration.poke_command, {command:g}, "
+        "limits them all; raise it for larger pokes"
+    ]
+
+
 def compute_random_amplitudes(bench: Bench, m2c: NDArray[np.float64], poke: float) -> NDArray[np.float64]:
     """Amplitude of each mode ``(n_modes,)`` for random pokes on all modes at once.
 

@@ -19,6 +19,7 @@ from escape_hw.calibration.acquisition.pokes import (
     PokeSequence,
     RandomPokes,
     compute_random_amplitudes,
+    note_limited_poke,
     select_random_pokes,
 )
 from escape_hw.calibration.acquisition.preview import MatrixPreview
@@ -174,14 +175,15 @@ def docrime_closed_run(
     record, skipped = acquisition.loop.record, acquisition.estimator_thread.skipped
     residual = select_settled_residual(record, bench.wfs.settings.frame_rate_hz)
     matrix = build_solution_matrix(
-        bench, grid, m2c, solution, method, poke=float(poke), clipped_pokes=record.shortened,
-        skipped=skipped, loop_gain=bench.config.loop.gain,
+        bench, grid, m2c, solution, method, poke=float(amplitude.max()),
+        clipped_pokes=record.shortened, skipped=skipped, loop_gain=bench.config.loop.gain,
         loop_residual_nm=root_mean_square(residual),
     )  # fmt: skip
     seconds = (solution.frames + solution.lost_frames) / bench.wfs.settings.frame_rate_hz
     notes = [
         *collect_solution_notes(solution, matrix),
         *collect_loop_notes(record, bench.wfs.settings.frame_rate_hz),
+        *note_limited_poke(bench, amplitude, poke),
     ]
     if skipped:
         notes.append(f"the estimate skipped {skipped} frames, because its sums were behind the loop")

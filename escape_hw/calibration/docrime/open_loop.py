@@ -19,6 +19,7 @@ from escape_hw.calibration.acquisition.pokes import (
     PokeSequence,
     RandomPokes,
     compute_random_amplitudes,
+    note_limited_poke,
     select_random_pokes,
 )
 from escape_hw.calibration.acquisition.sensor_setup import SETUP_FRAMES
@@ -99,9 +100,11 @@ def docrime_run(
     solution = solve_run(sensor.estimator, partial, acquisition.n_received)
     method = pattern.method + ("-whitened" if whiten and issubclass(pattern, RandomPokes) else "")
     matrix = build_solution_matrix(
-        bench, sensor.grid, m2c, solution, method, poke=float(poke), clipped_pokes=acquisition.shortened
-    )
-    return DocrimeRun(_result(acquisition, matrix, solution, partial), solution, acquisition.record())
+        bench, sensor.grid, m2c, solution, method, poke=float(amplitude.max()),
+        clipped_pokes=acquisition.shortened,
+    )  # fmt: skip
+    notes = note_limited_poke(bench, amplitude, poke)
+    return DocrimeRun(_result(acquisition, matrix, solution, partial, notes), solution, acquisition.record())
 
 
 def solve_run(estimator: DocrimeEstimator, aborted: bool, n_frames: int) -> DocrimeSolution:
@@ -166,7 +169,11 @@ def build_snr_criterion(
 
 
 def _result(
-    acquisition: OpenLoopAcquisition, matrix: InteractionMatrix, solution: DocrimeSolution, partial: bool
+    acquisition: OpenLoopAcquisition,
+    matrix: InteractionMatrix,
+    solution: DocrimeSolution,
+    partial: bool,
+    notes: list[str],
 ) -> CalibrationResult:
     """The calibration with the geometry improved by all frames."""
     seconds = (solution.frames + solution.lost_frames) / acquisition.bench.wfs.settings.frame_rate_hz
@@ -179,7 +186,7 @@ def _result(
         solution.response,
         partial=partial,
         mean_frame=acquisition.sensor.mean_frame,
-        notes=(*collect_solution_notes(solution, matrix), *acquisition.notes()),
+        notes=(*collect_solution_notes(solution, matrix), *acquisition.notes(), *notes),
     )
 
 

@@ -20,7 +20,11 @@ from escape_hw.calibration.acquisition.frames import (
     build_interaction_matrix,
     validate_frame_count,
 )
-from escape_hw.calibration.acquisition.pokes import compute_random_amplitudes, select_random_pokes
+from escape_hw.calibration.acquisition.pokes import (
+    compute_random_amplitudes,
+    note_limited_poke,
+    select_random_pokes,
+)
 from escape_hw.calibration.acquisition.sensor_setup import SETUP_FRAMES
 from escape_hw.calibration.acquisition.slope_statistics import SlopeStatistics
 from escape_hw.calibration.docrime.acquisition import AcquisitionRecord, OpenLoopAcquisition
@@ -89,7 +93,7 @@ def calibrate_short_run(
     n_frames = int(record[0].size)
     result = _build_result(
         bench, fit, geometry, m2c, frames=n_frames, lost=int(record[0][-1] - record[0][0]) + 1 - n_frames,
-        poke=float(poke), order=order, shortened=acquisition.shortened,
+        amplitude=amplitude, poke=poke, order=order, shortened=acquisition.shortened,
     )  # fmt: skip
     return replace(
         result,
@@ -131,14 +135,19 @@ def _build_result(
     *,
     frames: int,
     lost: int,
+    amplitude: NDArray[np.float64],
     poke: float,
     order: int,
     shortened: int,
 ) -> CalibrationResult:
-    """Calibration with the pseudo-synthetic matrix of a fit; ``shortened`` counts limited commands."""
+    """Calibration with the pseudo-synthetic matrix of a fit.
+
+    ``amplitude``: poke of each mode ``(n_modes,)``; ``poke``: as requested; ``shortened``: number of limited
+    commands.
+    """
     synthetic = synthesise_calibration(bench, grid, fit.estimate, m2c)
     metrics = {
-        **synthetic.matrix.metrics, "frames": frames, "lost_frames": lost, "poke": poke,
+        **synthetic.matrix.metrics, "frames": frames, "lost_frames": lost, "poke": float(amplitude.max()),
         "clipped_pokes": shortened, "delay_frames": fit.response.delay_frames, "whitening_order": order,
     }  # fmt: skip
     return replace(
@@ -148,7 +157,12 @@ def _build_result(
         lost_frames=lost,
         sky_seconds=(frames + lost) / bench.wfs.settings.frame_rate_hz,
         response=fit.response,
-        notes=(*fit.estimate.warnings, *fit.estimate.notes, _NOTE),
+        notes=(
+            *fit.estimate.warnings,
+            *fit.estimate.notes,
+            _NOTE,
+            *note_limited_poke(bench, amplitude, poke),
+        ),
     )
 
 
@@ -178,7 +192,8 @@ def calibrate_short_run_closed_loop(
     past = 2 * c.whiten_order + c.lags
     buffer = TelemetryBuffer(closed_loop.grid.n_slopes, closed_loop.matrix.n_modes, past + frames, past)
     slope_statistics = SlopeStatistics(closed_loop.grid.n_slopes)
-    yield from _record_frames(loop, frames, poke, past, buffer, slope_statistics)
+    amplitude = compute_random_amplitudes(bench, loop.m2c, poke)
+    yield from _record_frames(loop, frames, amplitude, past, buffer, slope_statistics)
     geometry = slope_statistics.annotate_geometry(closed_loop.grid, closed=True)
     data, _ = buffer.take_block()
     # Slopes without known commands of all lags and filters count as lost.
@@ -191,8 +206,8 @@ def calibrate_short_run_closed_loop(
         start=None if registration is None else registration.registration,
     )  # fmt: skip
     result = _build_result(
-        bench, fit, geometry, closed_loop.matrix.m2c, frames=frames, lost=buffer.lost, poke=float(poke),
-        order=order, shortened=loop.record.shortened,
+        bench, fit, geometry, closed_loop.matrix.m2c, frames=frames, lost=buffer.lost,
+        amplitude=amplitude, poke=poke, order=order, shortened=loop.record.shortened,
     )  # fmt: skip
     notes = collect_loop_notes(loop.record, bench.wfs.settings.frame_rate_hz)
     return replace(result, grid=geometry, notes=(*result.notes, *notes))
@@ -201,14 +216,13 @@ def calibrate_short_run_closed_loop(
 def _record_frames(
     loop: RunningLoop,
     frames: int,
-    poke: float,
+    amplitude: NDArray[np.float64],
     past: int,
     buffer: TelemetryBuffer,
     slope_statistics: SlopeStatistics,
 ) -> Procedure[None]:
     """Close the loop, poke while the telemetry is recorded, and flatten the mirror."""
     bench = loop.bench
-    amplitude = compute_random_amplitudes(bench, loop.m2c, poke)
     pokes = select_random_pokes(bench.config.calibration.pokes)(amplitude, bench.rng)
     settling_frames = max(loop.settling_frames - past, 0)
     stage = f"{pokes.title} in closed loop"

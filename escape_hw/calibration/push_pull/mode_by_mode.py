@@ -16,7 +16,7 @@ from escape_hw.api.sensor import SensorGeometry, SlopeFunction
 from escape_hw.bench import Bench
 from escape_hw.calibration.acquisition.checkpoint import Checkpoint
 from escape_hw.calibration.acquisition.frames import FluxMonitor, build_interaction_matrix
-from escape_hw.calibration.acquisition.pokes import compute_poke_amplitudes
+from escape_hw.calibration.acquisition.pokes import compute_poke_amplitudes, note_limited_poke
 from escape_hw.calibration.acquisition.preview import MatrixPreview
 from escape_hw.calibration.acquisition.sensor_setup import build_slope_function, ensure_sensor_ready
 from escape_hw.calibration.acquisition.slope_statistics import SlopeStatistics
@@ -63,6 +63,7 @@ class ModeByModeRun(abc.ABC):
         self.bench, self.frames, self._until, self._checkpoint = bench, frames, until, checkpoint
         self.m2c = build_modal_basis(bench)
         self.amplitude = compute_poke_amplitudes(bench, self.m2c, poke)
+        self._notes = tuple(note_limited_poke(bench, self.amplitude, poke))
         reject_accuracy_target(until)
         self.steps: list[Measurement] = []
 
@@ -186,10 +187,10 @@ class ModeByModeRun(abc.ABC):
         delivered, lost = self._count_frames()
         matrix = build_interaction_matrix(
             self.bench, self.grid, self.m2c[:, : data.shape[1]], data, sigma, self.method,
-            frames=delivered, lost_frames=lost, **metrics,
+            frames=delivered, lost_frames=lost, poke=float(self.amplitude.max()), **metrics,
         )  # fmt: skip
         return CalibrationResult(
             matrix, self.slope_statistics.annotate_geometry(self.grid), delivered, lost,
             (delivered + lost) / self.bench.wfs.settings.frame_rate_hz, response,
-            partial=partial, mean_frame=self.mean_frame,
+            partial=partial, mean_frame=self.mean_frame, notes=self._notes,
         )  # fmt: skip

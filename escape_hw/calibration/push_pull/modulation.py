@@ -73,8 +73,7 @@ def modulation_demodulation(
     c = bench.config.calibration
     n_frames = c.modulated_frames if frames is None else validate_frame_count(frames)
     run = _ModulationRun(bench, c.poke if poke is None else poke, n_frames, until, checkpoint)
-    poke = float(run.amplitude.max())
-    partial = yield from run.measure(grid, {"poke": poke, "frames": n_frames})
+    partial = yield from run.measure(grid, {"poke": float(run.amplitude.max()), "frames": n_frames})
     lines = run.all_lines()
     delay, error = estimate_delay(lines, c.lags - 1)
     data, sigma = compute_matrix(lines, delay)
@@ -84,7 +83,7 @@ def modulation_demodulation(
         )
     return run.build_result(
         data, sigma, partial, _as_temporal_response(delay, error, c.lags),
-        poke=poke, batches=len(run.steps), delay_frames=delay, delay_sigma=error,
+        batches=len(run.steps), delay_frames=delay, delay_sigma=error,
     )  # fmt: skip
 
 

@@ -80,9 +80,7 @@ def push_pull(
     poke = c.push_pull_poke if poke is None else poke
     run = _PushPullRun(bench, poke, n_frames, until, checkpoint)
     partial = yield from run.measure(grid, {"poke": poke, "frames": n_frames})
-    return run.build_result(
-        *run.estimate_matrix(), partial, poke=float(poke), settling_frames=run.settling_frames
-    )
+    return run.build_result(*run.estimate_matrix(), partial, settling_frames=run.settling_frames)
 
 
 class _PushPullRun(ModeByModeRun):

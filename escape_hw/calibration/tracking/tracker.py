@@ -152,13 +152,14 @@ class _Tracker:
             raise CalibrationError(
                 f"the matrix has no registration to start from: {'; '.join(start.warnings)}"
             )
-        self.pokes = RandomPokes(compute_poke_amplitudes(bench, matrix.m2c, poke), bench.rng)
+        amplitude = compute_poke_amplitudes(bench, matrix.m2c, poke)
+        self.pokes = RandomPokes(amplitude, bench.rng)
         self.response, self.memory = response, forgetting_time_s / STEP_S
         self.dropped = bench.config.loop.dropped_modes
         self.in_use = ActiveReconstructor(matrix, invert_matrix(matrix, self.dropped), start, 1.0)
         self.start = start.registration
         self.alarm_monitor = AlarmMonitor(start.registration, t.max_shift, response)
-        self.result = TrackResult(poke=poke)
+        self.result = TrackResult(poke=float(amplitude.max()))
         self.frames = max(1, round(STEP_S * bench.wfs.settings.frame_rate_hz))
         history = count_history_rows(c.whiten_order, c.lags)
         self.buffer = TelemetryBuffer(grid.n_slopes, matrix.n_modes, self.frames, history)
