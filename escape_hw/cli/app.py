@@ -45,7 +45,8 @@ def build_app() -> typer.Typer:
         cls=CommandGroup,
         help="Calibrates adaptive-optics systems without a calibration source.",
         epilog="Exit codes: 0 done · 1 finished but failed its own criterion · 2 bad usage or configuration, "
-        "nothing opened · 3 device or safety fault, mirror made safe · 130 aborted, partial data saved.",
+        "nothing opened · 3 device or safety fault, mirror made safe · 130 aborted, a partial result saved "
+        "if there is one.",
         no_args_is_help=True,
         add_completion=True,
         pretty_exceptions_enable=False,

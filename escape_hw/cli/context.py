@@ -38,6 +38,9 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 
+#: What happens while devices are closed: a system or a mirror, and any other device.
+MIRROR_CLOSING = "the mirror is being flattened and the devices closed"
+DEVICE_CLOSING = "the device is being closed"
 #: Signals that stop a command in an orderly way: Ctrl-C, a closed terminal, ``kill``, and Ctrl-\\.
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
 
@@ -59,7 +62,7 @@ class InterruptHandler:
         self.interrupted_by = ""
         self._notify = notify
         self._in_procedure = False
-        self._protected_activity = ""
+        self._closing = self._protected_activity = ""
         self._previous: dict[int, Any] = {}
 
     def __enter__(self) -> Self:
@@ -89,16 +92,19 @@ class InterruptHandler:
             self._in_procedure = False
 
     @contextmanager
-    def protect_closing(self, opened: AbstractContextManager[T]) -> Iterator[T]:
-        """Enter a device, system or server, and ignore signals while it is closed."""
+    def protect_closing(
+        self, opened: AbstractContextManager[T], closing: str = MIRROR_CLOSING
+    ) -> Iterator[T]:
+        """Enter a device, system or server, and ignore signals while it is closed; ``closing`` says how."""
+        self._closing = closing
         try:
             with opened as entered:
                 try:
                     yield entered
                 finally:
-                    self._protected_activity = "the mirror is being flattened and the devices closed"
+                    self._protected_activity = closing
         finally:
-            self._protected_activity = ""
+            self._closing = self._protected_activity = ""
 
     @contextmanager
     def protect_saving(self) -> Iterator[None]:
@@ -114,7 +120,7 @@ class InterruptHandler:
             self._notify(f"already stopping: {self._protected_activity}")
         elif self._in_procedure and not self.abort.is_set():
             self.abort.set()
-            self._notify("stopping: the mirror is flattened and the data are saved")
+            self._notify(f"stopping: {self._closing}" if self._closing else "stopping")
         else:
             self.interrupted_by = "Ctrl-C" if number == signal.SIGINT else signal.Signals(number).name
             raise KeyboardInterrupt(self.interrupted_by)
@@ -237,8 +243,8 @@ class CommandContext:
             partial: Any = stop.partial
             return partial, stop
 
-    def protect_saving(self, stop: Aborted | None) -> AbstractContextManager[None]:
-        """Context for saving a result: after an abort, further signals are ignored."""
+    def protect_saving(self, stop: EscapeError | None) -> AbstractContextManager[None]:
+        """Context for saving a result: after an abort or a failure, signals are ignored."""
         return contextlib.nullcontext() if stop is None else self.interrupts.protect_saving()
 
     def run_procedure(
@@ -266,7 +272,8 @@ class CommandContext:
             if resumed_run is not None:
                 self.notify(f"resuming {resumed_run}, which is not changed; products go to {folder.path}")
             if isinstance(procedure, ComputedProcedure):
-                result = self.run(procedure.compute())
+                with _note_without_result():
+                    result = self.run(procedure.compute())
                 saved = procedure.save_computed(folder, result, self.wall_seconds)
                 self.result(saved.document, met=saved.met)
                 self.show(*format_result(procedure.name, result, saved.document["simulated"], saved.document))
@@ -275,7 +282,8 @@ class CommandContext:
                 from escape_hw.runtime.session.record import BenchRecord
 
                 record = BenchRecord.from_bench(bench)
-                result, stop = self.run_keeping_partial(procedure.procedure(bench, folder))
+                with _note_without_result():
+                    result, stop = self.run_keeping_partial(procedure.procedure(bench, folder))
             with self.protect_saving(stop):
                 saved = procedure.save(folder, record, result, self.wall_seconds)
                 self.result(saved.document, met=saved.met)
@@ -309,10 +317,15 @@ class CommandContext:
         system = open_system(selection.system, set=selection.set, seed=selection.seed, mode=selection.mode)
         return self.open_protected(system)
 
-    def open_protected(self, device: AbstractContextManager[T]) -> AbstractContextManager[T]:
-        """Open a device or system, and close it at the end; a Ctrl-C does not interrupt the closing."""
+    def open_protected(
+        self, device: AbstractContextManager[T], closing: str = MIRROR_CLOSING
+    ) -> AbstractContextManager[T]:
+        """Open a device or system, and close it at the end; a Ctrl-C does not interrupt the closing.
+
+        ``closing`` says to an operator what is done then.
+        """
         self.devices_opened = True
-        return self.interrupts.protect_closing(device)
+        return self.interrupts.protect_closing(device, closing)
 
     def _require_not_served(self, selection: SystemSelection) -> None:
         """Refuse to open hardware that a server has opened."""
@@ -369,6 +382,16 @@ class CommandContext:
             document, self._document = self._document, None
             self._stdout.write(dumps(document) + "\n")
             self._stdout.flush()
+
+
+@contextmanager
+def _note_without_result() -> Iterator[None]:
+    """Say of a run that was aborted without a partial result that it leaves none."""
+    try:
+        yield
+    except Aborted as stop:
+        stop.add_note("no result was saved")
+        raise
 
 
 def _is_file_error(error: BaseException) -> TypeGuard[OSError]:

@@ -10,7 +10,7 @@ import tempfile
 from pathlib import Path
 
 from escape_hw.bounded_files import reason_of
-from escape_hw.errors import StorageError
+from escape_hw.errors import ConfigError, StorageError
 
 #: Free space that must remain after writing a file, in bytes.
 MARGIN_BYTES = 1 << 20
@@ -83,6 +83,19 @@ def check_writable(folder: Path, need_bytes: int = 0) -> None:
             os.fsync(probe.fileno())
     except OSError as error:
         raise storage_error(folder, error) from error
+
+
+def refuse_existing(*paths: Path | None) -> None:
+    """Refuse files that a command would overwrite; called before it does anything.
+
+    Raises
+    ------
+    ConfigError
+        A file, folder or link of that name exists.
+    """
+    for path in paths:
+        if path is not None and os.path.lexists(path):
+            raise ConfigError(f"{path}: exists already; choose another name or remove it first")
 
 
 def check_readable(folder: Path) -> None:

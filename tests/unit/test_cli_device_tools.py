@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from escape_hw.api.camera import Camera
 from escape_hw.api.emulator import EmulatorRequest
+from escape_hw.errors import DeviceLost
 from escape_hw.io.fits import file as fits_file
+from escape_hw.io.fits.frames import load_frames
+from escape_hw.runtime.host.computer import Host
 from escape_sim.emulators.asm.emulator import AsmEmulator, make_emulator
 
 LINKED = ("--set", "devices.dm.mode=hardware", "--set", "devices.dm.options.reply_s=10.0")
@@ -159,6 +166,62 @@ def test_snap_writes_frames_with_their_times(document, tmp_path: Path):
     assert hdus[0].header["SERIAL"] == "SIMWFS"
     code, _, _ = document("camera", "snap", "razor-shwfs", "--out", file)
     assert code == 2  # never overwritten
+
+
+def interrupt() -> None:
+    os.kill(os.getpid(), signal.SIGINT)
+
+
+def interrupt_twice() -> None:
+    interrupt()
+    interrupt()
+
+
+def lose_the_camera() -> None:
+    raise DeviceLost("wfs", "unplugged")
+
+
+@pytest.mark.parametrize(
+    ("happening", "code", "kind"),
+    [(interrupt, 130, "Aborted"), (interrupt_twice, 130, "Aborted"), (lose_the_camera, 3, "DeviceLost")],
+)
+def test_snap_saves_the_frames_before_an_interruption(
+    document, tmp_path: Path, monkeypatch, happening, code, kind
+):
+    take = Camera.next_frame
+
+    def next_frame(self, timeout_s):
+        if self.last_index == 1:
+            happening()
+        return take(self, timeout_s)
+
+    monkeypatch.setattr(Camera, "next_frame", next_frame)
+    monkeypatch.setattr("escape_hw.api.procedure.Reporter.PERIOD_S", 0.0)
+    found = document("camera", "snap", "razor-shwfs", "--frames", 50, "--out", tmp_path / "frames.fits")
+    assert (found[0], found[1]["error"]["type"]) == (code, kind)
+    file = tmp_path / "frames.partial.fits"
+    assert (found[1]["file"], found[1]["partial"]) == (str(file), True)
+    assert list(tmp_path.iterdir()) == [file]
+    product = load_frames(file)
+    assert len(product.result.data) == found[1]["frames"] in (2, 3)
+    assert product.header["FINISH"] == "aborted"
+    assert "mirror" not in found[2]
+
+
+@pytest.mark.parametrize("short_of", ["memory", "disk"])
+def test_a_recording_that_does_not_fit_is_refused_before_the_camera_opens(
+    document, tmp_path: Path, monkeypatch, short_of
+):
+    monkeypatch.setattr(Camera, "open", lambda self: pytest.fail("opened"))
+    if short_of == "memory":
+        monkeypatch.setattr(Host, "available_memory", lambda self: 100_000_000)
+    else:
+        usage = SimpleNamespace(free=20_000_000)
+        monkeypatch.setattr("escape_hw.io.storage.shutil.disk_usage", lambda folder: usage)
+    words = ("camera", "snap", "razor-shwfs", "--frames", 100, "--out", tmp_path / "frames.fits")
+    code, found, _ = document(*words)
+    needed = {"memory": "--frames 100: 128 MB of memory needed, 100 MB available", "disk": "33.0 MB needed"}
+    assert (code, needed[short_of] in found["error"]["message"]) == (2, True), found
 
 
 def test_show_describes_the_frames_in_a_file(document, escape, tmp_path: Path):

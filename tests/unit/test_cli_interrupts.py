@@ -26,7 +26,8 @@ def test_ctrl_c_in_a_calibration_saves_what_there_is(document, bench, tmp_path, 
     path = Path(found["products"]["im"])
     assert path.name == "im.partial.fits"
     assert load_matrix(path).result.partial
-    assert "stopping" in err
+    assert "stopping: the mirror is being flattened and the devices closed\n" in err
+    assert "no result was saved" not in err
     assert bench.benches[0].closed
     assert bench.benches[0].screen.state.inserted
     assert signal.getsignal(number) is before
@@ -43,8 +44,10 @@ def test_ctrl_c_in_the_loop(document, bench, im, tmp_path):
 
 def test_ctrl_c_before_anything_was_measured(document, bench, im, tmp_path):
     bench.hook = lambda name: name == "model_psf" and os.kill(os.getpid(), signal.SIGINT)
-    code, found, _ = document("loop", "razor-shwfs", "--im", im, "--out", tmp_path / "run")
+    code, found, err = document("loop", "razor-shwfs", "--im", im, "--out", tmp_path / "run")
     assert (code, found["error"]["type"]) == (130, "Aborted")
+    assert "saved" not in err.replace("no result was saved", "")
+    assert "no result was saved" in err
     assert bench.benches[0].closed
 
 

@@ -276,3 +276,9 @@ def test_missing_libraries_of_the_window_are_named(tmp_path: Path, monkeypatch: 
     finding = levels(tmp_path)["window"]
     assert (finding.level, finding.text) == ("warning", "Qt misses libxcb-icccm4")
     assert finding.remedy == "apt install libxcb-icccm4"
+
+
+def test_the_memory_that_programs_may_take_is_what_the_kernel_says(tmp_path: Path) -> None:
+    assert Host(tmp_path).available_memory() is None
+    put(tmp_path, "proc/meminfo", "MemTotal:       16000 kB\nMemAvailable:    9000 kB\n")
+    assert Host(tmp_path).available_memory() == 9000 * 1024

@@ -10,17 +10,19 @@ import typer
 
 from escape_hw.cli import options
 from escape_hw.cli.command import command
-from escape_hw.cli.context import CommandContext
+from escape_hw.cli.context import DEVICE_CLOSING, CommandContext
 from escape_hw.cli.devices.device_tools import DeviceCommand, SelectedDevice, select_device
-from escape_hw.errors import ConfigError
+from escape_hw.errors import ConfigError, EscapeError
 
 if TYPE_CHECKING:
-    from escape_hw.api.camera import Camera, CameraInfo, CameraSettings, Frame
+    from escape_hw.api.camera import Camera, CameraInfo, CameraSettings, Frame, Region
     from escape_hw.config.system import SystemConfig
 
 app = typer.Typer(
     help="Record frames of a camera, monitor or configure it; simulated or real.", no_args_is_help=True
 )
+#: Times that a recording is in memory while it is written: its frames, and copies of them.
+_COPIES = 4
 Which = Annotated[
     Literal["wfs", "science"], typer.Option("--camera", help="Wavefront sensor or science camera.")
 ]
@@ -37,35 +39,50 @@ def snap(
         Path | None, typer.Option("--out", metavar="FILE", help="FITS file (default: nothing is written).")
     ] = None,
 ) -> None:
-    """Record frames with the settings of the configuration."""
+    """Record frames with the settings of the configuration.
+
+    After Ctrl-C or a failure of the camera the frames so far are saved as *.partial.fits.
+    """
     import numpy as np
 
     from escape_hw.runtime.host.device_tools import grab_frames
 
     chosen = _camera(context, selection, camera)
     device = chosen.device
-    if out is not None and out.exists():
-        raise ConfigError(f"{out}: exists; choose another name or remove it")
-    with context.open_protected(device):
+    if chosen.section is not None:
+        _require_room(out, frames, chosen.section.settings().region)
+    recorded: list[Frame] = []
+    stop: EscapeError | None = None
+    with context.open_protected(device, DEVICE_CLOSING):
         settings, changed = _apply_configuration(context, chosen)
-        frame_list = context.run(grab_frames(device, frames, _timeout_s(chosen)))
-        info, status = device.info, device.status()
-    if out is not None:
-        _save(out, frame_list, info, settings, chosen.config)
-    cube = np.stack([frame.data for frame in frame_list])
-    counts = {"min": int(cube.min()), "max": int(cube.max()), "mean": float(cube.mean())}
-    saturated = max(frame.n_saturated for frame in frame_list)
-    context.show(
-        f"{info.model} {info.serial}: {len(frame_list)} frames of {cube.shape[2]} x {cube.shape[1]} "
-        f"pixels, {status.lost} lost, counts {counts['min']} to {counts['max']}, "
-        f"mean {counts['mean']:.1f}, {saturated} saturated",
-        *([f"written: {out}"] if out is not None else []),
-    )
-    context.report(
-        simulated=info.simulated, serial=info.serial, changed=changed, camera=camera, frames=len(frame_list),
-        shape=cube.shape[1:], counts=counts, saturated=saturated, lost=status.lost,
-        first_index=frame_list[0].index, settings=asdict(settings), file=out,
-    )  # fmt: skip
+        info = device.info
+        _require_room(out, frames, settings.region)
+        try:
+            context.run(grab_frames(device, frames, _timeout_s(chosen), recorded))
+        except EscapeError as error:
+            if not recorded:
+                raise
+            stop = error
+        status = device.status()
+    with context.protect_saving(stop):
+        if out is not None:
+            out = _save(out, recorded, info, settings, chosen.config, partial=stop is not None)
+        cube = np.stack([frame.data for frame in recorded])
+        counts = {"min": int(cube.min()), "max": int(cube.max()), "mean": float(cube.mean())}
+        saturated = max(frame.n_saturated for frame in recorded)
+        context.show(
+            f"{info.model} {info.serial}: {len(recorded)} frames of {cube.shape[2]} x {cube.shape[1]} "
+            f"pixels, {status.lost} lost, counts {counts['min']} to {counts['max']}, "
+            f"mean {counts['mean']:.1f}, {saturated} saturated",
+            *([f"written: {out}"] if out is not None else []),
+        )
+        context.report(
+            simulated=info.simulated, serial=info.serial, changed=changed, camera=camera,
+            frames=len(recorded), shape=cube.shape[1:], counts=counts, saturated=saturated, lost=status.lost,
+            first_index=recorded[0].index, settings=asdict(settings), file=out, partial=stop is not None,
+        )  # fmt: skip
+    if stop is not None:
+        raise stop
 
 
 @app.command("stream", cls=DeviceCommand)
@@ -81,7 +98,7 @@ def stream(
 
     chosen = _camera(context, selection, camera)
     device = chosen.device
-    with context.open_protected(device):
+    with context.open_protected(device, DEVICE_CLOSING):
         settings, changed = _apply_configuration(context, chosen)
         statistics = context.run(monitor_camera(device, seconds, _timeout_s(chosen)))
         info = device.info
@@ -120,7 +137,7 @@ def settings(
     device = chosen.device
     if not check:
         chosen.announce_change(context, "exposure, frame rate, gain and region")
-    with context.open_protected(device):
+    with context.open_protected(device, DEVICE_CLOSING):
         base = device.settings if chosen.section is None else chosen.section.settings()
         requested = _requested_settings(base, exposure, rate, gain, region)
         achievable = device.check(requested)
@@ -139,6 +156,26 @@ def _camera(context: CommandContext, selection: options.SystemSelection, key: st
     from escape_hw.api.camera import Camera
 
     return select_device(context, selection, key, Camera)  # type: ignore[type-abstract]
+
+
+def _require_room(out: Path | None, frames: int, region: Region) -> None:
+    """Refuse a recording that would overwrite a file, or that disk or memory cannot hold."""
+    from escape_hw.io.fits.file import partial_path
+    from escape_hw.io.storage import check_writable, make_folder, refuse_existing
+    from escape_hw.runtime.host.computer import Host
+
+    # Counts of 16 bits.
+    size = 2 * frames * region.width * region.height
+    available = Host().available_memory()
+    if available is not None and _COPIES * size > available:
+        raise ConfigError(
+            f"--frames {frames}: {_COPIES * size / 1e6:.0f} MB of memory needed, {available / 1e6:.0f} MB "
+            "available; record fewer frames at a time, or a smaller region"
+        )
+    if out is not None:
+        refuse_existing(out, partial_path(out))
+        make_folder(out.absolute().parent)
+        check_writable(out.absolute().parent, size)
 
 
 def _timeout_s(chosen: SelectedDevice[Camera]) -> float:
@@ -195,7 +232,10 @@ def _save(
     info: CameraInfo,
     settings: CameraSettings,
     config: SystemConfig | None,
-) -> None:
+    *,
+    partial: bool,
+) -> Path:
+    """Save the frames; returns the file, whose name says if it is ``partial``."""
     from escape_hw.io.fits.frames import save_frames
     from escape_hw.io.provenance import Provenance
 
@@ -203,4 +243,4 @@ def _save(
     if config is not None:
         name, text, seed = config.system.name, config.to_toml(), config.system.seed
     origin = Provenance(text, seed=seed, serials={"camera": info.serial})
-    save_frames(out, frame_list, info, settings, name, origin)
+    return save_frames(out, frame_list, info, settings, name, origin, partial=partial)

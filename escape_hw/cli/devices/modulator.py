@@ -11,7 +11,7 @@ import typer
 
 from escape_hw.cli import options
 from escape_hw.cli.command import command
-from escape_hw.cli.context import CommandContext
+from escape_hw.cli.context import DEVICE_CLOSING, CommandContext
 from escape_hw.cli.devices.device_tools import DeviceCommand, SelectedDevice, select_device
 from escape_hw.errors import ConfigError
 
@@ -59,7 +59,7 @@ def start(
     device, section = chosen.device, chosen.section
     requested = _requested_modulation(chosen, radius, radius_rad, frequency)
     chosen.announce_change(context, "servos on, auto-zero where needed, centre, then the circle")
-    with context.open_protected(device):
+    with context.open_protected(device, DEVICE_CLOSING):
         achievable = device.check(requested)
         context.notify(f"requested: {_format_modulation(requested, section)}")
         context.notify(f"achievable: {_format_modulation(achievable, section)}")
@@ -89,7 +89,7 @@ def stop(context: CommandContext, selection: options.DeviceSelection) -> None:
     chosen = _device(context, selection)
     device, section = chosen.device, chosen.section
     chosen.announce_change(context, "centre, servos off")
-    with context.open_protected(device):
+    with context.open_protected(device, DEVICE_CLOSING):
         device.park()
         status = device.status()
     context.show(*_format_status(status, section), "left parked")

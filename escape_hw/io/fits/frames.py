@@ -29,13 +29,16 @@ def save_frames(
     settings: CameraSettings,
     system: str,
     origin: Provenance | None = None,
+    *,
+    partial: bool = False,
 ) -> Path:
     """Write frames as one cube ``(n_frames, rows, columns)`` with their counters and times.
 
     Returns
     -------
     Path
-        The file written.
+        The file written; a ``partial`` recording, which ended before its last frame, is written as
+        ``*.partial.fits``.
 
     Raises
     ------
@@ -58,7 +61,9 @@ def save_frames(
         fits_file.image_extension("FRAMES", np.stack([frame.data for frame in frames]), "count"),
         fits_file.table_extension("TIMES", columns),
     ]
-    return fits_file.write_product(path, KIND_FRAMES, hdus, system, info.simulated, origin, cards=cards)
+    return fits_file.write_product(
+        path, KIND_FRAMES, hdus, system, info.simulated, origin, partial=partial, cards=cards
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

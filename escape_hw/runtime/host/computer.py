@@ -69,6 +69,14 @@ class Host:
             resource.getrlimit(resource.RLIMIT_MEMLOCK)[1],
         )
 
+    def available_memory(self) -> int | None:
+        """Bytes of memory that programs may still take; ``None`` where the kernel does not say."""
+        for line in (self.text("proc/meminfo") or "").splitlines():
+            name, _, value = line.partition(":")
+            if name == "MemAvailable":
+                return 1024 * int(value.split()[0])
+        return None
+
     def groups(self) -> set[str]:
         """Groups of this process."""
         names = set()

@@ -144,16 +144,17 @@ def run_wave(
         dm.flatten()
 
 
-def grab_frames(camera: Camera, frames: int, timeout_s: float) -> Procedure[list[Frame]]:
-    """Record frames of an open camera; each may take ``timeout_s`` seconds."""
+def grab_frames(camera: Camera, frames: int, timeout_s: float, recorded: list[Frame]) -> Procedure[None]:
+    """Record frames of an open camera; each may take ``timeout_s`` seconds.
+
+    They are appended to ``recorded``, so that an abort or a failure of the camera does not lose them.
+    """
     report = Reporter("grabbing", frames)
-    found: list[Frame] = []
     for number in range(1, frames + 1):
-        found.append(camera.next_frame(timeout_s))
+        recorded.append(camera.next_frame(timeout_s))
         if report.is_due():
             yield report(number)
     camera.stop()
-    return found
 
 
 def monitor_camera(camera: Camera, seconds: float, timeout_s: float) -> Procedure[CameraStatistics]:
