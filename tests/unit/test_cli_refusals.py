@@ -53,6 +53,36 @@ def test_bad_usage_exits_2_with_one_line_and_nothing_opened(escape, document, be
 
 
 @pytest.mark.parametrize(
+    ("words", "file"),
+    [
+        (("influence", "im.fits", "--out", "im.fits"), "im.fits"),
+        (("export", "aot", "im.fits", "--out", "small.toml"), "small.toml"),
+        (("export", "pyrtc", "im.fits", "--out", "."), "pyrtc.yaml"),
+        (("import", "aot", "im.fits", "razor-shwfs", "--out", "im.fits"), "im.fits"),
+        (("import", "aot", "a", "razor-shwfs", "--out", "x", "--telemetry", "small.toml"), "small.toml"),
+        (("import", "arrays", "m.toml", "razor-shwfs", "--out", "m.toml"), "m.toml"),
+        (("import", "pyrtc", "p.yaml", "razor-shwfs", "--out", "p.yaml"), "p.yaml"),
+        (("import", "milk", "image", "--out", "small.toml"), "small.toml"),
+        (("import", "pyrtc-stream", "image", "--out", "small.toml"), "small.toml"),
+        (("camera", "snap", "razor-shwfs", "--out", "frames.fits"), "frames.fits"),
+        (("camera", "snap", "razor-shwfs", "--out", "frames.fits"), "frames.partial.fits"),
+        (("config", "init", "small", "--out", "small.toml"), "small.toml"),
+        (("report", "run", "--picture", "small.toml"), "small.toml"),
+        (("night-log", "--out", "night.html"), "night.html"),
+        (("gui", "razor-shwfs", "--screenshot", "small.toml"), "small.toml"),
+        (("replay", "im.fits", "--screenshot", "im.fits"), "im.fits"),
+    ],
+)
+def test_a_file_that_exists_is_not_overwritten(escape, tmp_path, monkeypatch, words, file):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / file).write_text("of somebody")
+    code, _, err = escape(*words)
+    assert (code, err) == (2, f"error: {file}: exists already; choose another name or remove it first\n")
+    assert [path.name for path in tmp_path.iterdir()] == [file]
+    assert (tmp_path / file).read_text() == "of somebody"
+
+
+@pytest.mark.parametrize(
     ("words", "meant"),
     [
         (("calibrate", "REVOLT-SHWFS"), "revolt-shwfs"),

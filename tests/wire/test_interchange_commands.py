@@ -63,7 +63,7 @@ def test_a_recorded_loop_goes_to_aot_and_back(tmp_path: Path, im: Path, document
     np.testing.assert_allclose(load_telemetry(moves).result.commands, record.commands, atol=1e-15)
     code, told, _ = document("show", moves)
     assert (code, told["frames"]) == (0, 200)
-    code, told, _ = document("import", "aot", aot, "razor-shwfs", "--out", back)
+    code, told, _ = document("import", "aot", aot, "razor-shwfs", "--out", tmp_path / "x.fits")
     assert code == 2
     assert "has 37 actuators, that of system 'razor-shwfs' 97" in told["error"]["message"]
 

@@ -34,8 +34,10 @@ def influence(
     from escape_hw.config.loader import load_text
     from escape_hw.config.registry import model_factory
     from escape_hw.io.fits.influence import save_influence
+    from escape_hw.io.storage import refuse_existing
     from escape_hw.runtime.session.record import config_provenance
 
+    refuse_existing(out)
     product = _fitted_matrix(source)
     if not product.config_text.strip():
         raise IncompatibleProduct(f"{product.path}: has no configuration; calibrate again with this version")

@@ -127,8 +127,10 @@ def report(
 ) -> None:
     """Build the report of a run again from its products."""
     from escape_hw.io.run_folder import read_result
+    from escape_hw.io.storage import refuse_existing
     from escape_hw.report.run_report import write_picture, write_report
 
+    refuse_existing(picture)
     path = write_report(run)
     old = read_result(run)
     context.show(f"report: {path}")
@@ -158,8 +160,10 @@ def night_log(
 ) -> None:
     """Show the log of a night, or write it as Markdown or HTML with figures."""
     from escape_hw.io.run_folder import default_runs_folder
+    from escape_hw.io.storage import refuse_existing
     from escape_hw.report.night_log import NightReport
 
+    refuse_existing(out)
     report = NightReport.read(runs or default_runs_folder(), system, night)
     files = () if out is None else report.write(out)
     if out is None:

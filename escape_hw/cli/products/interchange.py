@@ -49,11 +49,13 @@ def export_pyrtc(
     import numpy as np
 
     from escape_hw.io.fits.matrix import load_matrix
-    from escape_hw.io.interchange.pyrtc.calibration import FrameSettings, export_matrix
+    from escape_hw.io.interchange.pyrtc.calibration import FrameSettings, export_matrix, export_paths
     from escape_hw.io.interchange.pyrtc.files import read_file
+    from escape_hw.io.storage import refuse_existing
 
     if commands and modes is not None:
         raise ConfigError("--commands and --modes: choose one of them")
+    refuse_existing(*export_paths(out).values())
     product = load_matrix(im)
     system_config = _system_config(product)
     wanted = None if modes is None else np.asarray(read_file(modes).data, float)
@@ -79,7 +81,9 @@ def export_aot(
     from escape_hw.io.fits.matrix import load_matrix
     from escape_hw.io.fits.telemetry import load_telemetry
     from escape_hw.io.interchange.aot import AotSystem, write_aot
+    from escape_hw.io.storage import refuse_existing
 
+    refuse_existing(out)
     product = load_matrix(im)
     system_config = _system_config(product)
     dm = system_config.devices.dm
@@ -142,7 +146,9 @@ def import_pyrtc(
 ) -> None:
     """Read the matrix of a pyRTC configuration as a product of a system."""
     from escape_hw.io.interchange.pyrtc.calibration import PyrtcConfig, TargetSystem, import_matrix
+    from escape_hw.io.storage import refuse_existing
 
+    refuse_existing(out)
     ours = context.load_config(selection)
     target = TargetSystem(
         ours.system.name, ours.sensor.kind, ours.sensor.n_sub, ours.devices.dm.n_act, ours.simulated
@@ -171,8 +177,10 @@ def import_aot(
 
     from escape_hw.io.fits.telemetry import save_telemetry
     from escape_hw.io.interchange.aot import read_aot
+    from escape_hw.io.storage import refuse_existing
     from escape_hw.runtime.session.record import config_provenance
 
+    refuse_existing(out, telemetry)
     ours = context.load_config(selection)
     content = read_aot(file, stroke, loop)
     found = content.calibration
@@ -207,8 +215,10 @@ def import_plain_arrays(
 ) -> None:
     """Read a matrix in text, NumPy or FITS files as a product of a system."""
     from escape_hw.io.interchange.arrays import described_files, import_arrays, read_description
+    from escape_hw.io.storage import refuse_existing
     from escape_hw.runtime.session.array_target import array_target
 
+    refuse_existing(out)
     ours, facts = context.load_config(selection), read_description(description)
     folder = description.absolute().parent
     result = import_arrays(facts, folder, array_target(ours), im)
@@ -225,7 +235,9 @@ def import_milk(
 ) -> None:
     """Read arrays of a shared-memory image of milk."""
     from escape_hw.io.interchange.milk.stream import MilkStream
+    from escape_hw.io.storage import refuse_existing
 
+    refuse_existing(out)
     _record_stream(context, MilkStream.open(name), frames, out)
 
 
@@ -239,7 +251,9 @@ def import_pyrtc_stream(
 ) -> None:
     """Read arrays of a stream of a running pyRTC (needs pyshmem)."""
     from escape_hw.io.interchange.pyrtc.stream import ShmemStream
+    from escape_hw.io.storage import refuse_existing
 
+    refuse_existing(out)
     _record_stream(context, ShmemStream.open(name), frames, out)
 
 

@@ -10,7 +10,6 @@ import typer
 from escape_hw.cli import options
 from escape_hw.cli.command import command
 from escape_hw.cli.context import CommandContext
-from escape_hw.errors import ConfigError
 
 if TYPE_CHECKING:
     from escape_hw.config.system import SystemConfig
@@ -67,7 +66,7 @@ def init(
 ) -> None:
     """Write a new configuration: every key with its meaning, unit and range."""
     from escape_hw.config.templates import starter_text
-    from escape_hw.io.storage import write_atomic
+    from escape_hw.io.storage import refuse_existing, write_atomic
 
     text = starter_text(name, base)
     context.set_subject(name, None, None)
@@ -75,8 +74,7 @@ def init(
         context.show(text.rstrip("\n"))
         context.report(toml=text)
         return
-    if out.exists():
-        raise ConfigError(f"{out}: exists already; choose another name or remove it first")
+    refuse_existing(out)
     write_atomic(out, text.encode())
     context.show(f"{out}: written; edit it, then: escape config check {out}")
     context.report(file=out)

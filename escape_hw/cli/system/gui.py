@@ -34,9 +34,11 @@ def gui(
     """Open the window: live views, calibrations, the loop."""
     with command_context("gui") as context:
         from escape_hw.config.registry import window_runner
+        from escape_hw.io.storage import refuse_existing
 
         if system and connect:
             raise ConfigError("give a system or --connect, not both")
+        refuse_existing(screenshot)
         context.code = window_runner()(system or "", connect or "", screenshot, reset_settings)
 
 
@@ -50,7 +52,9 @@ def replay(
     """Replay a finished run in the window."""
     with command_context("replay") as context:
         from escape_hw.config.registry import window_runner
+        from escape_hw.io.storage import refuse_existing
 
+        refuse_existing(screenshot)
         if not recording.is_dir() and not (recording.suffix == ".fits" and recording.is_file()):
             raise ProductError(f"{recording}: neither a product (.fits) nor the folder of a run")
         context.code = window_runner()(str(recording.absolute()), "", screenshot, False)

@@ -308,8 +308,10 @@ def _read_modes(config: PyrtcConfig, target: TargetSystem, n_modes: int) -> NDAr
     return m2c
 
 
-SETTINGS_FILE = "pyrtc.yaml"
-_FILE_NAMES = {"im": "im.npz", "valid": "valid_sub_aps.npz", "references": "ref_slopes.npz", "m2c": "m2c.npy"}
+_FILE_NAMES = {
+    "im": "im.npz", "valid": "valid_sub_aps.npz", "references": "ref_slopes.npz", "m2c": "m2c.npy",
+    "settings": "pyrtc.yaml",
+}  # fmt: skip
 #: Maximum relative part of a requested mode outside of the span of the matrix's modes.
 _MAX_RESIDUAL = 1e-6
 
@@ -355,6 +357,11 @@ def convert_basis(matrix: InteractionMatrix, m2c: NDArray[np.float64]) -> Intera
     )  # fmt: skip
 
 
+def export_paths(folder: Path) -> dict[str, Path]:
+    """Paths by name of the files that :func:`export_matrix` writes into a folder."""
+    return {name: folder / file for name, file in _FILE_NAMES.items()}
+
+
 def export_matrix(
     folder: Path, result: CalibrationResult, frame: FrameSettings, m2c: NDArray[np.float64] | None = None
 ) -> dict[str, Path]:
@@ -368,7 +375,7 @@ def export_matrix(
     Returns
     -------
     dict
-        Paths by name: ``im``, ``valid``, ``references``, ``m2c``, ``settings``.
+        The paths, see :func:`export_paths`.
 
     Raises
     ------
@@ -379,7 +386,7 @@ def export_matrix(
     """
     matrix = result.matrix if m2c is None else convert_basis(result.matrix, m2c)
     slopes, mask, references, (data, sigma) = _sensor_parts(result.grid, frame, matrix)
-    paths = {name: folder / file for name, file in _FILE_NAMES.items()}
+    paths = export_paths(folder)
     kind = {"wfs_type": "pywfs" if isinstance(result.grid, PyramidPupils) else "shwfs"}
     record = {
         "system": matrix.system,
@@ -404,7 +411,6 @@ def export_matrix(
         },
         "loop": {"im_file": _FILE_NAMES["im"]},
     }
-    paths["settings"] = folder / SETTINGS_FILE
     yaml_lines = ["# Written by ESCAPE: merge these keys into pyRTC's configuration, in this folder."]
     for name, values in sections.items():
         yaml_lines.append(f"{name}:")
