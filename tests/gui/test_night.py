@@ -1,4 +1,4 @@
-"""A whole night of operation in the window: on a real display (Xvfb) where there is one, and without one."""
+"""A whole night of operation in the window: on a display (Xvfb) where it is installed, else without one."""
 
 from __future__ import annotations
 
@@ -23,12 +23,11 @@ TESTS = Path(__file__).parents[1]
 
 @contextmanager
 def display() -> Iterator[dict[str, str]]:
-    """A virtual X server; what a program that uses it needs in its environment."""
+    """A virtual X server, or none where it is not installed; what a program needs in its environment."""
     xvfb = shutil.which("Xvfb")
-    if xvfb is None:
-        pytest.skip("Xvfb is not installed (apt install xvfb)")
-    if missing := missing_qt_libraries():
-        pytest.skip(f"Qt needs libraries for a display: apt install {' '.join(missing)}")
+    if xvfb is None or missing_qt_libraries():
+        yield {"QT_QPA_PLATFORM": "offscreen"}
+        return
     width, height = night.SIZES[-1]
     read, write = os.pipe()
     words = [
@@ -69,16 +68,13 @@ def work_through_the_night(folder: Path, environment: dict[str, str]) -> list[di
 
 @pytest.mark.campaign
 @pytest.mark.timeout(3600)
-@pytest.mark.parametrize("on", ["Xvfb", "offscreen"])
-def test_a_night_of_operation(on: str, tmp_path: Path) -> None:
+def test_a_night_of_operation(tmp_path: Path) -> None:
     began = time.monotonic()
-    if on == "Xvfb":
-        with display() as environment:
-            said = work_through_the_night(tmp_path, environment)
-    else:
-        said = work_through_the_night(tmp_path, {"QT_QPA_PLATFORM": "offscreen"})
+    with display() as environment:
+        said = work_through_the_night(tmp_path, environment)
     assert [one["step"] for one in said] == list(night.STEPS)
     images = list((tmp_path / "screenshots").glob("*.png"))
     assert len(images) % (len(night.SIZES) * len(night.THEMES)) == 0
     assert len(images) >= 6 * len(night.SIZES) * len(night.THEMES)
-    print(f"night in {time.monotonic() - began:.0f} s; {len(images)} images in {tmp_path / 'screenshots'}")
+    print(f"night on {environment} in {time.monotonic() - began:.0f} s")
+    print(f"{len(images)} images in {tmp_path / 'screenshots'}")

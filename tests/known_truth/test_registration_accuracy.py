@@ -104,18 +104,16 @@ def test_a_fit_of_a_thin_plate_is_right_within_its_errors_or_says_that_it_failed
 
 
 @pytest.mark.campaign
-# 330,000 frames and 120 fits: more than 20 minutes of processor time, in two processes.
-@pytest.mark.timeout(7200)
-def test_thirty_registrations_short_and_two_seconds() -> None:
-    """The paper's SHORT run and a tenth of it: accurate, with correct errors of every parameter."""
-    curves = run(sky_time(SYSTEM, realisations=30, frames=(1000, 10_000), overrides=GAUSSIAN_TWIN))
-    for estimator in ("whitened", "telemetry"):
-        for frames in (1000, 10_000):
-            assert _meets_goal(curves, estimator, frames)
-            at = curves["frames"].index(frames)
-            for name in PARAMETERS:
-                # The matrix route states shift and rotation up to three times as large as it errs on
-                # mirrors that are nearly as its model has them: its errors contain those of other mirrors.
-                least = 0.5 if estimator == "telemetry" else 0.11
-                assert least <= curves["chi2"][estimator][name][at] <= 2.0, (estimator, frames, name)
+@pytest.mark.timeout(1800)
+def test_ten_registrations_from_fifty_and_a_thousand_frames() -> None:
+    """The paper's goal from a tenth of its frames and less, with correct errors of every parameter."""
+    curves = run(sky_time(SYSTEM, realisations=10, frames=(50, 1000), overrides=GAUSSIAN_TWIN))
+    for estimator, frames in (("whitened", 1000), ("telemetry", 50), ("telemetry", 1000)):
+        assert _meets_goal(curves, estimator, frames)
+        at = curves["frames"].index(frames)
+        for name in PARAMETERS:
+            # The matrix route states shift and rotation up to three times as large as it errs on
+            # mirrors that are nearly as its model has them: its errors contain those of other mirrors.
+            least = 0.2 if estimator == "telemetry" else 0.07
+            assert least <= curves["chi2"][estimator][name][at] <= 2.5, (estimator, frames, name)
     assert (np.array([curves["bound"][p][0] for p in PARAMETERS]) < GOAL).all()

@@ -129,17 +129,3 @@ def _attempt(bench: System):
         return bench.calibrate(frames=60).registration
     except CalibrationError:
         return None
-
-
-@pytest.mark.campaign
-@pytest.mark.timeout(1800)
-@pytest.mark.parametrize("frames", [20, 50])
-def test_twenty_realisations(frames):
-    """Accurate; the scalings have a bias that their errors do not contain (docs/studies/validation.md)."""
-    found = [_calibrate(number, frames, *GAUSSIAN_TWIN) for number in range(20)]
-    errors = np.array([e for e, _ in found])
-    sigma = np.array([r.registration.sigma for _, r in found])
-    assert (np.sqrt(np.mean(errors**2, axis=0)) <= GOAL).all()
-    chi2 = np.mean(np.square(errors / sigma), axis=0)
-    assert (chi2 > 0.3).all(), chi2
-    assert (chi2 < [2.5, 2.5, 2.5, 5.0, 5.0]).all(), chi2
