@@ -34,7 +34,7 @@ SHWFS, TABLE1 = ("reproduce", "shwfs", "--system", "SYSTEM"), ("reproduce", "tab
 #: products that are whole; products that say they are partial.
 PLACES = {
     "grid": ((*CALIBRATE, "--method", "push-pull", *SLOW), "find the lenslet grid", 0, [], []),
-    "push-pull": ((*CALIBRATE, "--method", "push-pull", "--frames", 500), "push-pull", 1.0, [], ["im"]),
+    "push-pull": ((*CALIBRATE, "--method", "push-pull", "--frames", 100), "push-pull", 1.0, [], ["im"]),
     "DO-CRIME": ((*CALIBRATE, "--method", "docrime", "--frames", ENDLESS), "DO-CRIME", 0.8, [], ["im"]),
     "ESCAPE": ((*CALIBRATE, "--frames", ENDLESS), "DO-CRIME", 0.8, [], ["im"]),
     "model PSF": ((*LOOP, *SLOW), "model PSF", 0, [], []),
