@@ -4,18 +4,24 @@ from __future__ import annotations
 
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
 from escape_hw.cli import options
 from escape_hw.cli.command import command
 from escape_hw.cli.context import CommandContext
-from escape_hw.cli.devices.device_tools import DeviceCommand, SelectedDevice, select_device
+from escape_hw.cli.devices.device_tools import (
+    DeviceCommand,
+    SelectedDevice,
+    check_number,
+    select_device,
+)
 from escape_hw.errors import ConfigError
 
 if TYPE_CHECKING:
-    from escape_hw.api.camera import Camera, CameraInfo, CameraSettings, Frame
+    from escape_hw.api.camera import Camera, CameraInfo, CameraSettings, Frame, Region
+    from escape_hw.config.devices import CameraConfig
     from escape_hw.config.system import SystemConfig
 
 app = typer.Typer(
@@ -118,11 +124,12 @@ def settings(
     """Check settings, then set them; shows the settings in force, as TOML to paste."""
     chosen = _camera(context, selection, camera)
     device = chosen.device
+    changes = _requested_changes(chosen, exposure, rate, gain, region)
     if not check:
         chosen.announce_change(context, "exposure, frame rate, gain and region")
     with context.open_protected(device):
         base = device.settings if chosen.section is None else chosen.section.settings()
-        requested = _requested_settings(base, exposure, rate, gain, region)
+        requested = replace(base, **changes)
         achievable = device.check(requested)
         now = achievable if check else device.configure(requested)
         info = device.info
@@ -160,23 +167,38 @@ def _apply_configuration(
     return chosen.device.configure(requested), True
 
 
-def _requested_settings(
-    base: CameraSettings, exposure: float | None, rate: float | None, gain: float | None, region: str | None
-) -> CameraSettings:
-    """The configured settings with the options applied."""
+def _requested_changes(
+    chosen: SelectedDevice[Camera],
+    exposure: float | None,
+    rate: float | None,
+    gain: float | None,
+    region: str | None,
+) -> dict[str, Any]:
+    """The settings that the options give, within what any camera has, and this one as configured."""
+    changes: dict[str, Any] = {
+        "exposure_s": check_number("--exposure", exposure, 1e-6, 60, "s"),
+        "frame_rate_hz": check_number("--frame-rate", rate, 0.01, 20000, "Hz"),
+        "gain_db": check_number("--gain", gain, 0, 48, "dB"),
+        "region": None if region is None else _parse_region(region, chosen.section),
+    }
+    return {name: value for name, value in changes.items() if value is not None}
+
+
+def _parse_region(text: str, section: CameraConfig | None) -> Region:
+    """A region that lies on the sensor, as far as it is known."""
     from escape_hw.api.camera import Region
 
-    if region is not None:
-        parts = region.split(",")
-        if len(parts) != 4 or not all(part.strip().isdigit() for part in parts):
-            raise ConfigError(f"--region {region}: write X,Y,WIDTH,HEIGHT in integer pixels")
-        base = replace(base, region=Region(*map(int, parts)))
-    return replace(
-        base,
-        exposure_s=base.exposure_s if exposure is None else exposure,
-        frame_rate_hz=base.frame_rate_hz if rate is None else rate,
-        gain_db=base.gain_db if gain is None else gain,
-    )
+    parts = text.split(",")
+    if len(parts) != 4 or not all(part.strip().isdecimal() for part in parts):
+        raise ConfigError(f"--region {text}: write X,Y,WIDTH,HEIGHT in integer pixels")
+    region = Region(*map(int, parts))
+    if min(region.width, region.height) < 1:
+        raise ConfigError(f"--region {text}: width and height must be at least 1 pixel")
+    if section is not None:
+        columns, rows = section.sensor_px
+        if region.x + region.width > columns or region.y + region.height > rows:
+            raise ConfigError(f"--region {text}: does not lie on the sensor of {columns} x {rows} pixels")
+    return region
 
 
 def _format_toml(settings: CameraSettings) -> list[str]:
