@@ -22,7 +22,7 @@ from rich.console import Console, RenderableType
 from escape_hw.api.concurrency import SignalSafeFlag
 from escape_hw.bounded_files import shorten_path
 from escape_hw.deprecation import RenamedWarning
-from escape_hw.errors import Aborted, ConfigError, EscapeError, StorageError
+from escape_hw.errors import Aborted, ConfigError, EscapeError, StorageError, TooFewFrames
 from escape_hw.runtime.display.console import DisplayConsole
 from escape_hw.runtime.procedures.declaration import ComputedProcedure
 
@@ -262,6 +262,7 @@ class CommandContext:
         selection = selection.with_overrides(*procedure.overrides)
         config = self.load_config(selection)
         procedure.load(config)
+        procedure.require_first(config)
         with self.run_folder(config, procedure.kind, out) as folder:
             if resumed_run is not None:
                 self.notify(f"resuming {resumed_run}, which is not changed; products go to {folder.path}")
@@ -343,7 +344,7 @@ class CommandContext:
     def _classify_error(self, error: BaseException) -> tuple[int, str, str]:
         if isinstance(error, KeyboardInterrupt):
             return ABORTED, "Aborted", f"interrupted by {str(error) or 'Ctrl-C'}"
-        if isinstance(error, StorageError) and not self.devices_opened:
+        if isinstance(error, StorageError | TooFewFrames) and not self.devices_opened:
             return USAGE, type(error).__name__, str(error)
         if isinstance(error, EscapeError):
             return error.exit_code, type(error).__name__, str(error)
