@@ -292,15 +292,19 @@ class CommandContext:
         # and a failing import loses no data.
         from escape_hw.io.run_folder import RunFolder
 
-        with RunFolder(config.system.name, kind, out) as folder:
-            self.folder = folder
-            if folder.requested_path is not None:
-                self.notify(
-                    f"{folder.requested_path} holds files already and is left alone; "
-                    f"this run goes to {folder.path}"
-                )
-            folder.write_config(config.to_toml())
-            yield folder
+        try:
+            with RunFolder(config.system.name, kind, out) as folder:
+                self.folder = folder
+                if folder.requested_path is not None:
+                    self.notify(
+                        f"{folder.requested_path} holds files already and is left alone; "
+                        f"this run goes to {folder.path}"
+                    )
+                folder.write_config(config.to_toml())
+                yield folder
+        except StorageError as error:
+            error.add_note("--out chooses the folder of a run")
+            raise
 
     def bench(self, selection: SystemSelection) -> AbstractContextManager[System]:
         """The open system; finally the mirror is flattened and the devices are closed."""
@@ -354,6 +358,8 @@ class CommandContext:
         if _is_file_error(error):
             message = f"{shorten_path(os.fsdecode(error.filename))}: {error.strerror or error}"
             return (FAILED if self.devices_opened else USAGE), "StorageError", message
+        if isinstance(error, MemoryError):
+            return FAILED, "MemoryError", f"not enough memory ({error}); ask for fewer frames or modes"
         message = f"{type(error).__name__}: {error} (this is a defect of ESCAPE)"
         if self.folder is not None and self.folder.path.is_dir():
             # The run folder has logged the traceback.

@@ -74,6 +74,7 @@ def nothing_opens(monkeypatch):
         (("camera", "settings", "razor-shwfs", "--exposure", -1), "--exposure is -1; it must be at least"),
         (("camera", "settings", "razor-shwfs", "--frame-rate", 0), "--frame-rate is 0; it must be at least"),
         (("camera", "settings", "razor-shwfs", "--gain", -1), "--gain is -1; it must be at least 0"),
+        (("camera", "snap", "razor-shwfs", "--out", "/dev/null/a.fits"), "/dev/null: cannot be written"),
         (("modulator", "start", "razor-pywfs", "--frequency", 0), "--frequency is 0; it must be at least"),
         (("modulator", "start", "razor-pywfs", "--frequency", "nan"), "--frequency is nan; it must be"),
         (("modulator", "start", "razor-pywfs", "--radius", "inf"), "a radius of inf lambda/D tilts"),

@@ -46,12 +46,16 @@ def snap(
     """Record frames with the settings of the configuration."""
     import numpy as np
 
+    from escape_hw.io.storage import check_writable, make_folder
     from escape_hw.runtime.host.device_tools import grab_frames
 
     chosen = _camera(context, selection, camera)
     device = chosen.device
-    if out is not None and out.exists():
-        raise ConfigError(f"{out}: exists; choose another name or remove it")
+    if out is not None:
+        if out.exists():
+            raise ConfigError(f"{out}: exists; choose another name or remove it")
+        make_folder(out.absolute().parent)
+        check_writable(out.absolute().parent)
     with context.open_protected(device):
         settings, changed = _apply_configuration(context, chosen)
         frame_list = context.run(grab_frames(device, frames, _timeout_s(chosen)))
