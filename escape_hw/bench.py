@@ -289,7 +289,7 @@ def build_standalone_device(driver: str, kind: type[D], /, **settings: Any) -> D
         The driver is unknown, not installed, of another class, works as a part of a system only, or does not
         take these settings.
     """
-    driver_class = device_class(driver)
+    driver_class = device_class(driver, kind)
     _require_arguments(driver, driver_class, settings)
     if issubclass(driver_class, DeformableMirror) and settings.get("limits") is not None:
         settings["limits"] = parse_limits(driver, settings["limits"])

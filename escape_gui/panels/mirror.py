@@ -41,6 +41,8 @@ from escape_hw.remote.state import Phase, PokePlan, State
 
 COMMAND, MEASURED = "command", "measured"
 ACTUATOR, MODE = "actuator", "mode"
+#: Number of the first of each, as in the configuration and in offsets.
+_FIRST = {ACTUATOR: 0, MODE: 1}
 #: Time without a poke or an edit after which pokes are disarmed, seconds.
 ARMED_S = 120.0
 #: Largest command, fraction of full stroke, of a mirror that is shown as flat.
@@ -138,15 +140,14 @@ class MirrorPanel(Panel):
         self.poke_kind = SegmentedButton(
             "Poke of", (ACTUATOR, MODE), ("Click an actuator in the map", "Click a mode in 'Mode maps'")
         )
-        self.poke_kind.chosen.connect(lambda _: self._on_poke_edit())
-        self.poke_number = NumberBox(1, 100_000, step=1, decimals=0)
-        self.poke_number.setValue(1)
+        self.poke_kind.chosen.connect(self._on_kind)
+        self.poke_number = NumberBox(0, 100_000, step=1, decimals=0)
         self.poke_amplitude = NumberBox(-1, 1, step=0.01, decimals=3)
         self.poke_amplitude.setValue(0.05)
         self.poke_seconds = NumberBox(0.1, LONGEST_POKE_S, step=1, decimals=1)
         self.poke_seconds.setValue(2.0)
         for box, name in (
-            (self.poke_number, "Number of the actuator or mode"),
+            (self.poke_number, "Number of the actuator (from 0) or mode (from 1)"),
             (self.poke_amplitude, "Amplitude, fraction of full stroke"),
             (self.poke_seconds, "Duration in seconds"),
         ):
@@ -215,21 +216,25 @@ class MirrorPanel(Panel):
 
     def _choose(self, kind: str, number: int) -> None:
         self.poke_kind.buttons[kind].setChecked(True)
-        self.poke_number.setValue(number + 1)
+        self.poke_number.setValue(number + _FIRST[kind])
+        self._on_poke_edit()
+
+    def _on_kind(self, kind: str) -> None:
+        self.poke_number.setValue(max(self.poke_number.value(), _FIRST[kind]))
         self._on_poke_edit()
 
     def _on_poke_edit(self) -> None:
         """Mark the actuator and request the plan of the poke."""
         self._plan = None
         self._armed_until = time.monotonic() + ARMED_S
-        number = round(self.poke_number.value()) - 1
-        armed, kind = self.arm_button.isChecked(), self.poke_kind.selected
+        kind, number, *_ = request = self._poke_request
+        armed = self.arm_button.isChecked()
         rows, columns = np.nonzero(self._map.numbers == number)
         marked = armed and kind == ACTUATOR and rows.size > 0
         self._spot.setData([columns.mean() + 0.5] if marked else [], [rows.mean() + 0.5] if marked else [])
         if not armed:
             return
-        request = (kind, number, self.poke_amplitude.value(), self.poke_seconds.value())
+        self.poke_number.low = _FIRST[kind]
         for box in (self.poke_number, self.poke_amplitude, self.poke_seconds):
             if not box.low <= box.value() <= box.high:
                 self._show_poke(
@@ -243,8 +248,9 @@ class MirrorPanel(Panel):
 
     @property
     def _poke_request(self) -> tuple[str, int, float, float]:
-        number = round(self.poke_number.value()) - 1
-        return self.poke_kind.selected, number, self.poke_amplitude.value(), self.poke_seconds.value()
+        kind = self.poke_kind.selected
+        number = round(self.poke_number.value()) - _FIRST[kind]
+        return kind, number, self.poke_amplitude.value(), self.poke_seconds.value()
 
     def _show_plan(self, plan: PokePlan, request: tuple[str, int, float, float]) -> None:
         if request == self._poke_request:

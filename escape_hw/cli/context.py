@@ -22,7 +22,7 @@ from rich.console import Console, RenderableType
 from escape_hw.api.concurrency import SignalSafeFlag
 from escape_hw.bounded_files import shorten_path
 from escape_hw.deprecation import RenamedWarning
-from escape_hw.errors import Aborted, ConfigError, EscapeError, StorageError
+from escape_hw.errors import Aborted, ConfigError, EscapeError, StorageError, TooFewFrames
 from escape_hw.runtime.display.console import DisplayConsole
 from escape_hw.runtime.procedures.declaration import ComputedProcedure
 
@@ -268,6 +268,7 @@ class CommandContext:
         selection = selection.with_overrides(*procedure.overrides)
         config = self.load_config(selection)
         procedure.load(config)
+        procedure.require_first(config)
         with self.run_folder(config, procedure.kind, out) as folder:
             if resumed_run is not None:
                 self.notify(f"resuming {resumed_run}, which is not changed; products go to {folder.path}")
@@ -299,15 +300,19 @@ class CommandContext:
         # and a failing import loses no data.
         from escape_hw.io.run_folder import RunFolder
 
-        with RunFolder(config.system.name, kind, out) as folder:
-            self.folder = folder
-            if folder.requested_path is not None:
-                self.notify(
-                    f"{folder.requested_path} holds files already and is left alone; "
-                    f"this run goes to {folder.path}"
-                )
-            folder.write_config(config.to_toml())
-            yield folder
+        try:
+            with RunFolder(config.system.name, kind, out) as folder:
+                self.folder = folder
+                if folder.requested_path is not None:
+                    self.notify(
+                        f"{folder.requested_path} holds files already and is left alone; "
+                        f"this run goes to {folder.path}"
+                    )
+                folder.write_config(config.to_toml())
+                yield folder
+        except StorageError as error:
+            error.add_note("--out chooses the folder of a run")
+            raise
 
     def bench(self, selection: SystemSelection) -> AbstractContextManager[System]:
         """The open system; finally the mirror is flattened and the devices are closed."""
@@ -356,7 +361,7 @@ class CommandContext:
     def _classify_error(self, error: BaseException) -> tuple[int, str, str]:
         if isinstance(error, KeyboardInterrupt):
             return ABORTED, "Aborted", f"interrupted by {str(error) or 'Ctrl-C'}"
-        if isinstance(error, StorageError) and not self.devices_opened:
+        if isinstance(error, StorageError | TooFewFrames) and not self.devices_opened:
             return USAGE, type(error).__name__, str(error)
         if isinstance(error, EscapeError):
             return error.exit_code, type(error).__name__, str(error)
@@ -366,6 +371,8 @@ class CommandContext:
         if _is_file_error(error):
             message = f"{shorten_path(os.fsdecode(error.filename))}: {error.strerror or error}"
             return (FAILED if self.devices_opened else USAGE), "StorageError", message
+        if isinstance(error, MemoryError):
+            return FAILED, "MemoryError", f"not enough memory ({error}); ask for fewer frames or modes"
         message = f"{type(error).__name__}: {error} (this is a defect of ESCAPE)"
         if self.folder is not None and self.folder.path.is_dir():
             # The run folder has logged the traceback.

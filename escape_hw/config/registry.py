@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.metadata
 import inspect
 import sys
@@ -73,11 +74,21 @@ def call_factory(what: str, kind: type[T], factory: Callable[..., object], *argu
             f"{_raised_at(error)}"
         ) from error
     if not isinstance(product, kind):
-        raise ConfigError(
-            f"{what} creates a {type(product).__name__}, not a {kind.__name__}; "
-            f"{_factory_name(factory)} must return one"
-        )
+        wrong = f"{what} creates a {type(product).__name__}, not a {kind.__name__}"
+        if isinstance(product, Device) and issubclass(kind, Device):
+            raise ConfigError(f"{wrong}{_suggest_drivers(kind)}")
+        raise ConfigError(f"{wrong}; {_factory_name(factory)} must return one")
     return product
+
+
+def _suggest_drivers(kind: type[Device]) -> str:
+    """The drivers for real hardware that create devices of a class, for messages."""
+    names = []
+    for name in available(DEVICES):
+        with contextlib.suppress(ConfigError):
+            # A driver that is not completely installed, or part of a system only, is no way out.
+            names += [name] if issubclass(device_class(name), kind) else []
+    return f"; drivers that do: {', '.join(names)}" if names else ""
 
 
 def _factory_name(factory: object) -> str:
@@ -192,17 +203,21 @@ def device_factory(name: str, *, hardware: bool = False) -> DeviceFactory:
     return _as_device_factory(*_find_device(name, hardware))
 
 
-def device_class(name: str) -> type[Device]:
+def device_class(name: str, kind: type[Device] = Device) -> type[Device]:
     """The class of a driver that can be opened without a system: its keywords are the driver's own.
 
     Raises
     ------
     ConfigError
-        As :func:`device_factory`, or the driver works as a part of a system only.
+        As :func:`device_factory`, the driver works as a part of a system only, or creates no ``kind``.
     """
     *_, found = _find_device(name, hardware=not name.startswith(TWIN_PREFIX))
     if isinstance(found, type) and issubclass(found, Device):
-        return found
+        if issubclass(found, kind):
+            return found
+        raise ConfigError(
+            f"driver '{name}' creates a {found.__name__}, not a {kind.__name__}{_suggest_drivers(kind)}"
+        )
     raise ConfigError(
         f"device driver '{name}' works as a part of a system only; open the system (open_system, or its name "
         "in place of --driver)"

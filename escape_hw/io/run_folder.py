@@ -199,9 +199,9 @@ def read_result(folder: Path | str) -> dict[str, Any]:
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
-        raise ProductError(
-            f"{path}: cannot be read ({error.strerror or error}); is this a run folder?"
-        ) from error
+        log = path.with_name(LOG_FILE)
+        hint = f"the run has no result, see {log}" if log.is_file() else "is this a run folder?"
+        raise ProductError(f"{path}: cannot be read ({error.strerror or error}); {hint}") from error
     except (ValueError, RecursionError) as error:
         raise ProductError(f"{path}: damaged; not a JSON document ({error})") from error
     if not isinstance(document, dict) or not isinstance(document.get("products"), dict):

@@ -15,7 +15,7 @@ from escape_hw.errors import ConfigError, StorageError
 #: Free space that must remain after writing a file, in bytes.
 MARGIN_BYTES = 1 << 20
 
-_ELSEWHERE = "choose another folder (--out on a command line)"
+_ELSEWHERE = "choose another folder"
 _REMEDIES = {
     errno.ENOSPC: "free some space or " + _ELSEWHERE,
     errno.EDQUOT: "your quota is used up; free some space or " + _ELSEWHERE,

@@ -74,6 +74,7 @@ def test_an_unknown_estimator(shared):
     [
         ({"gain": 0}, ConfigError, "gain is 0"),
         ({"gain": -0.3}, ConfigError, "gain is -0.3"),
+        ({"gain": 9}, ConfigError, "gain is 9 .* at most 2"),
         ({"gain": math.nan}, ConfigError, "gain is nan"),
         ({"gain": math.inf}, ConfigError, "gain is inf"),
         ({"leak": -0.1}, ConfigError, "leak -0.1"),

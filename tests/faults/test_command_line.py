@@ -7,11 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from command_line import document, escape
+from small_bench import small
 from small_system import SMALL, configuration
 
 from escape_hw import register_device
+from escape_hw.calibration.acquisition.checkpoint import Checkpoint
+from escape_hw.calibration.modes.bases import build_modal_basis
 from escape_hw.config import registry
 from escape_hw.io.fits.matrix import load_matrix, save_matrix
+from escape_hw.io.fits.run_state import STATE_FILE
 from escape_hw.io.provenance import Provenance
 from escape_hw.testing import FaultyCamera, FaultyMirror
 from escape_sim.devices import twins as devices
@@ -52,6 +56,20 @@ def im(good, tmp_path_factory):
     """A good matrix as a product."""
     origin = Provenance(configuration().to_toml(), "kl", 1)
     return save_matrix(tmp_path_factory.mktemp("im") / "im.fits", good.run.result, origin)
+
+
+@pytest.fixture(scope="module")
+def interrupted(tmp_path_factory):
+    """The folder of an interrupted DO-CRIME run of the small bench."""
+    folder = tmp_path_factory.mktemp("interrupted")
+    (folder / "config.toml").write_text(configuration().to_toml())
+    request = {"method": "docrime", "frames": 300, "whiten": True}
+    checkpoint = Checkpoint(folder / STATE_FILE, request=request)
+    with small() as bench:
+        settings = {"poke": bench.config.calibration.poke, "whiten": True, "correlations": False}
+        checkpoint.begin(bench, "docrime", build_modal_basis(bench), settings)
+        checkpoint.save({}, {}, None)
+    return folder
 
 
 SETTINGS = [
@@ -102,10 +120,38 @@ SETTINGS = [
         (("loop", "SYSTEM", "--im", "absent.fits"), "absent.fits"),
         (("loop", "SYSTEM", "--im", "SYSTEM"), "not a FITS file"),
         (("sprint", "SYSTEM", "--im", "SYSTEM"), "not a FITS file"),
+        (("sweep", "SYSTEM", "--sampler", "best"), "--sampler best: unknown; it is one of random, tpe"),
+        (("sweep", "SYSTEM", "--metric", "best"), "--metric best: unknown; it is one of peak"),
+        (("sweep", "SYSTEM", "--margin", "0"), "--margin 0: it must be positive"),
+        (("sweep", "SYSTEM", "--gains", "gains.fits"), "--gains needs --im"),
+        (("sweep", "SYSTEM", "--im", "IM", "--gains", "absent.fits"), "absent.fits"),
+        (("sweep", "SYSTEM", "--im", "IM", "--im", "IM"), "two of the matrices have files of the same name"),
+        (("sweep", "SYSTEM", "--gain", "0.1:9"), "out of range (allowed range 0 < x <= 2)"),
+        (("sweep", "SYSTEM", "--gain", "0.1,9,0.2"), "out of range (allowed range 0 < x <= 2)"),
+        (("sweep", "SYSTEM", "--delay", "late"), "delay: late must be a number of frames"),
+        (("sweep", "SYSTEM", "--calibration-frames", "50"), "at least 82 frames"),
+        (("sweep", "SYSTEM", "--storage", "foo://bar"), "--storage foo://bar: Can't load plugin"),
+        (("sweep", "SYSTEM", "--scheduler", "nowhere"), "--scheduler nowhere: "),
+        (("sweep", "--resume", "RUN"), "sweep.json: cannot be read"),
+        (("flat", "SYSTEM"), "no dark frame"),
+        (("calibrate", "SYSTEM", "--frames", "12"), "at least 13 frames"),
+        (("calibrate", "SYSTEM", "--frames", "50", "--snr", "3"), "no signal-to-noise ratio"),
+        (("calibrate", "SYSTEM", "--frames", "50", "--estimator", "matrix"), "at least 82 frames"),
+        (("calibrate", "SYSTEM", "--frames", "50", "--method", "docrime"), "at least 82 frames"),
+        (("calibrate", "SYSTEM", "--frames", "50", "--method", "push-pull-fast"), "at least 82 frames"),
+        (("calibrate", "SYSTEM", "--frames", "2", "--method", "modulated"), "use more frames"),
+        (("calibrate", "SYSTEM", "--set", "calibration.frames=50", "--method", "docrime"), "at least 82"),
+        (("calibrate", "--resume", "RUN", "--set", "loop.gain=0.31"), "this run's in loop.gain;"),
+        (("calibrate", "--resume", "RUN", "--poke", "0.01"), "its poke is 0.02, this run's is 0.01"),
+        (("calibrate", "--resume", "RUN", "--no-whiten"), "its whiten is True, this run's is False"),
+        (("calibrate", "--resume", "RUN", "--closed-loop", "IM"), "its control matrix is None"),
+        (("calibrate", "--resume", "RUN", "--method", "escape"), "its method is 'docrime'"),
+        (("calibrate", "maps-nir", "--resume", "RUN"), "its system is 'razor-shwfs', this run's is"),
     ],
 )
-def test_refused_with_exit_2_before_anything_is_opened(run, system, im, words, match):
-    code, document, err = run(*({"SYSTEM": system, "IM": im}.get(word, word) for word in words))
+def test_refused_with_exit_2_before_anything_is_opened(run, system, im, interrupted, words, match):
+    stands_for = {"SYSTEM": system, "IM": im, "RUN": interrupted}
+    code, document, err = run(*(stands_for.get(word, word) for word in words))
     assert code == 2
     assert match in document["error"]["message"]
     assert match in err
@@ -224,14 +270,7 @@ def test_a_failed_camera_and_a_lost_mirror_exit_3(run, system, im, tmp_path, mon
     assert "closing dm" in err
 
 
-def test_too_few_frames_no_light_and_no_response_exit_1(run, system, tmp_path):
-    few = ("--frames", 50, "--method", "docrime")
-    code, document, _ = run("calibrate", system, *few, "--out", tmp_path / "a")
-    assert (code, document["error"]["type"]) == (1, "TooFewFrames")
-    assert "at least 82 frames" in document["error"]["message"]
-    code, document, _ = run("calibrate", system, "--frames", 12, "--out", tmp_path / "few")
-    assert (code, document["error"]["type"]) == (1, "TooFewFrames")
-    assert "at least 13 frames" in document["error"]["message"]
+def test_no_light_and_no_response_exit_1(run, system, tmp_path):
     dark = ("--set", "twin.wfs.photons_per_frame=1")
     code, document, _ = run("calibrate", system, "--frames", 300, *dark, "--out", tmp_path / "b")
     assert (code, document["error"]["type"]) == (1, "CalibrationError")

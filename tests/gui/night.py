@@ -171,10 +171,10 @@ class Night:
         y, x = (int(size) // 2 for size in numbers.shape)
         click_pixel(mirror.image_view, x, y)
         number = int(numbers[y, x])
-        assert mirror.poke_number.value() == number + 1
+        assert mirror.poke_number.value() == number
         assert mirror.poke_kind.selected == "actuator"
         self.operator.until(
-            lambda: f"actuator {number + 1} at +0.05" in mirror.poke_text.text(), mirror.poke_text.text()
+            lambda: f"actuator {number} at +0.05" in mirror.poke_text.text(), mirror.poke_text.text()
         )
         flat = np.zeros(int(numbers.max()) + 1)
         poked = np.where(np.arange(flat.size) == number, mirror.poke_amplitude.value(), flat)
@@ -190,7 +190,7 @@ class Night:
         self.operator.until(lambda: np.allclose(commands(), flat, atol=1e-6), "the mirror is flat")
         self.operator.until(lambda: self.state.mirror.peak < 1e-6, "the server says so")
         self.operator.until(lambda: "flat again" in mirror.poke_text.text(), "the panel says so")
-        self.events.append(f"poke of actuator {number + 1} at +0.05 of the stroke")
+        self.events.append(f"poke of actuator {number} at +0.05 of the stroke")
         self.images("poke")
         self.operator.press(mirror.arm_button)
         self.key(Qt.Key.Key_3, Qt.KeyboardModifier.ControlModifier)

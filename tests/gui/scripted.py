@@ -351,8 +351,9 @@ class ScriptedControl:
     def check_poke(self, kind: str, number: int, amplitude: float, seconds: float) -> PokePlan:
         """What a poke would do."""
         self._note("check_poke", kind=kind, number=number, amplitude=amplitude, seconds=seconds)
+        number += kind == "mode"
         return PokePlan(
-            description=f"{kind} {number + 1} at {amplitude:+g} of the stroke (+150 nm of surface)",
+            description=f"{kind} {number} at {amplitude:+g} of the stroke (+150 nm of surface)",
             peak=abs(amplitude), peak_nm=150.0, allowed=0.4, refusal=self.refusal,
         )  # fmt: skip
 

@@ -136,8 +136,8 @@ def test_an_actuator_is_poked_by_arming_clicking_and_holding(
     qtbot.mouseClick(mirror.arm_button, Qt.MouseButton.LeftButton)
     click_pixel(mirror.image_view, 5, 5)
     number = int(mirror._map.numbers[5, 5])
-    assert mirror.poke_number.value() == number + 1
-    qtbot.waitUntil(lambda: f"actuator {number + 1} at +0.05" in mirror.poke_text.text())
+    assert mirror.poke_number.value() == number
+    qtbot.waitUntil(lambda: f"actuator {number} at +0.05" in mirror.poke_text.text())
     window.update_timer.tick(force=True)
     qtbot.mouseClick(mirror.poke_button, Qt.MouseButton.LeftButton)
     assert "poke" not in control.verbs, "a click is not enough"
@@ -211,6 +211,12 @@ def test_a_clicked_mode_is_chosen_while_pokes_are_armed(
     qtbot.mouseClick(mirror.arm_button, Qt.MouseButton.LeftButton)
     modes.mosaic.choose(7)
     qtbot.waitUntil(lambda: "mode 8 at +0.05" in mirror.poke_text.text())
+    assert mirror.poke_number.value() == 8
+    # Modes count from 1, actuators from 0.
+    mirror._choose("actuator", 0)
+    qtbot.waitUntil(lambda: "actuator 0 at +0.05" in mirror.poke_text.text())
+    mirror.poke_kind.buttons["mode"].click()
+    qtbot.waitUntil(lambda: "mode 1 at +0.05" in mirror.poke_text.text())
 
 
 def test_strokes_are_shown_in_nanometres_too(window: MainWindow, mirror: MirrorPanel) -> None:

@@ -14,7 +14,15 @@ import numpy as np
 import pytest
 from serving import SYSTEM, Served, serving, until_idle, wait_for
 
-from escape_hw.errors import Aborted, CalibrationError, ConfigError, LeaseHeld, ProductError, RequestRefused
+from escape_hw.errors import (
+    Aborted,
+    CalibrationError,
+    ConfigError,
+    LeaseHeld,
+    ProductError,
+    RequestRefused,
+    TooFewFrames,
+)
 from escape_hw.remote.client import Connection
 from escape_hw.remote.state import DeviceHealth, Finish, Phase
 from escape_hw.runtime.procedures.calibration import METHODS
@@ -235,8 +243,10 @@ def test_a_check_gives_frames_time_and_stroke_and_moves_nothing(bench: Connectio
 
 
 def test_a_failed_run_gives_the_reason_and_the_server_continues(bench: Connection) -> None:
-    run = bench.start("docrime", frames=20)
-    with pytest.raises(CalibrationError, match="20 frames cannot constrain 30 modes"):
+    with pytest.raises(TooFewFrames, match="20 frames cannot constrain 30 modes"):
+        bench.start("docrime", frames=20)
+    run = bench.start("flat", frames=20)
+    with pytest.raises(CalibrationError, match="no dark frame"):
         run.wait(60)
     until_idle(bench)
     assert bench.state.fault is None

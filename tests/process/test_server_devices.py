@@ -100,7 +100,7 @@ def test_in_closed_loop_only_the_exposure_of_the_science_camera_changes(
 def test_a_poke_is_checked_held_and_returns_to_flat_by_itself(bench: Connection) -> None:
     plan = bench.check_poke("actuator", 5, 0.05)
     assert plan.refusal == ""
-    assert plan.description.startswith("actuator 6 at +0.05 of the stroke (")
+    assert plan.description.startswith("actuator 5 at +0.05 of the stroke (")
     assert plan.peak_nm > 0
     assert bench.state.mirror.peak == 0.0
     bench.poke("actuator", 5, 0.05, seconds=1.0)
@@ -130,7 +130,9 @@ def test_a_mode_is_poked_and_flatten_ends_the_poke(bench: Connection) -> None:
 
 def test_pokes_beyond_the_mirror_are_refused(bench: Connection) -> None:
     n_act = sum(row.count("1") for row in bench.geometry().layout)
-    with pytest.raises(RequestRefused, match=f"the mirror has {n_act}"):
+    with pytest.raises(
+        RequestRefused, match=f"actuator {n_act} does not exist; the mirror has 0 to {n_act - 1}"
+    ):
         bench.check_poke("actuator", n_act, 0.05)
     with pytest.raises(RequestRefused, match="the basis has"):
         bench.poke("mode", 1000, 0.05)

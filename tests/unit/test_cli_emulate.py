@@ -58,6 +58,8 @@ def test_violations_are_reported_and_change_the_exit_code(document, monkeypatch)
     [
         (("e272",), "did you mean 'e727'"),
         (("e727", "--option", "serial"), "write KEY=VALUE"),
+        (("e727", "--host", "nowhere.invalid", "--port", 0), "(0: any) or --host"),
+        (("asm", "--host", "nowhere.invalid", "--port", 0), "(0: any) or --host"),
         (("e727", "--option", "volume=11"), "--option volume: unknown"),
     ],
 )

@@ -29,6 +29,17 @@ def test_failed_calibration_exits_1(document, bench, tmp_path):
     assert document("calibrate", "razor-shwfs", "--out", tmp_path / "run")[0] == 1
 
 
+def test_too_little_memory_is_no_defect(document, bench, tmp_path):
+    def fail(name: str) -> None:
+        raise MemoryError("Unable to allocate 7 TiB")
+
+    bench.hook = fail
+    code, found, err = document("calibrate", "razor-shwfs", "--out", tmp_path / "run")
+    assert (code, found["error"]["type"]) == (1, "MemoryError")
+    assert "not enough memory (Unable to allocate 7 TiB); ask for fewer frames" in err
+    assert bench.benches[0].closed
+
+
 def test_defect_exits_3_with_its_traceback_in_the_log(document, bench, tmp_path):
     bench.hook = lambda name: 1 // 0
     code, found, err = document("calibrate", "razor-shwfs", "--out", tmp_path / "run")

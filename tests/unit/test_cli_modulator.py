@@ -108,10 +108,10 @@ def test_for_some_seconds_and_then_parked(document, stage):
 
 def test_what_it_cannot_do_is_refused_before_it_turns(document, stage):
     emulator, here = stage
-    code, found, err = document("modulator", "start", "razor-pywfs", "--radius", 30, *here)
+    code, found, err = document("modulator", "start", "razor-pywfs", "--frequency", 4000, *here)
     assert code == 3
     assert found["error"]["type"] == "SettingRejected"
-    assert "the range is 0 to 0.001 rad" in err
+    assert "frequency_hz is 4000" in err
     assert not [line for line in emulator.controller.received_commands if line.startswith("WGO ")]
     assert emulator.controller.state.describe() == "at rest"
 

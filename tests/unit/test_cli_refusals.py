@@ -39,6 +39,9 @@ from escape_hw.runtime.procedures.matrix_input import load_fitting_matrix
         ("streams", "--seconds", 1e80),
         ("emulate", "e727", "--seconds", 1e80),
         ("modulator", "start", "razor-pywfs", "--seconds", 1e80),
+        ("discover", "--host", ""),
+        ("discover", "--host", "host:port"),
+        ("discover", "--host", "host:99999"),
     ],
 )
 def test_bad_usage_exits_2_with_one_line_and_nothing_opened(escape, document, bench, words):
@@ -140,9 +143,24 @@ def test_damaged_matrix_is_refused(document, bench, im):
 
 def test_unwritable_folder_exits_2_before_anything_opens(document, bench, tmp_path):
     (tmp_path / "file").write_text("")
-    code, found, _ = document("calibrate", "razor-shwfs", "--out", tmp_path / "file" / "run")
+    code, found, err = document("calibrate", "razor-shwfs", "--out", tmp_path / "file" / "run")
     assert (code, found["error"]["type"]) == (2, "StorageError")
+    assert "--out chooses the folder of a run" in err
     assert not bench.benches
+
+
+def test_hosts_that_do_not_answer_are_named(escape, monkeypatch):
+    monkeypatch.setattr("escape_hw.runtime.host.discovery.discover", lambda hosts: [])
+    code, _, err = escape("discover", "--host", "a", "--host", "b:5")
+    assert (code, "none answers on a, b:5" in " ".join(err.split())) == (1, True)
+
+
+def test_a_run_that_can_be_resumed_is_shown_with_the_way_to_go_on(document, escape, tmp_path):
+    (tmp_path / "run.state").touch()
+    command = f"escape calibrate --resume {tmp_path}"
+    code, found, _ = document("show", tmp_path)
+    assert (code, found["resume"]) == (0, command)
+    assert f"not finished and has no result; resume with: {command}" in escape("show", tmp_path)[1]
 
 
 def test_a_calibration_that_came_to_its_end_is_not_resumed_but_shown(document, bench, tmp_path):

@@ -107,6 +107,13 @@ def test_images_of_every_layout_are_read_and_written(folder: Path, release: str,
         stream.close()
 
 
+@pytest.mark.parametrize("version", ["foo", "1.00", "2.000", ""])
+def test_another_version_is_not_written(folder: Path, version: str) -> None:
+    with pytest.raises(ValueError, match=f"layout '{version}': versions 2.00 to 2.99"):
+        MilkStream.create("one", (5, 7), "u2", version=version)
+    assert not list(folder.iterdir())
+
+
 def test_a_file_of_another_size_is_refused(folder: Path) -> None:
     path = layout.shm_path("frame")
     path.write_bytes(bytes(head_of("frame")).ljust(2000, b"\0"))

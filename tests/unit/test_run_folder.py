@@ -97,7 +97,7 @@ def test_impossible_place_is_refused(home, out):
         # A file of that name is left alone, and the run gets a sibling.
         assert RunFolder("s", "k", home / out).path == home / "file-2"
     else:
-        with pytest.raises(StorageError, match="--out"):
+        with pytest.raises(StorageError, match="choose another folder"):
             RunFolder("s", "k", home / out)
     assert (home / "file").read_text() == "kept"
 
@@ -123,6 +123,19 @@ def test_damaged_result_is_refused_by_name(home, content):
     if content is not None:
         (home / "result.json").write_text(content)
     with pytest.raises(ProductError, match=r"result\.json: "):
+        read_result(home)
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EACCES, errno.EIO])
+def test_messages_of_files_name_no_option_that_only_runs_have(number):
+    message = str(storage.storage_error(Path("a"), OSError(number, "reason")))
+    assert "a: cannot be written (reason)" in message
+    assert "--out" not in message
+
+
+def test_a_run_without_a_result_is_referred_to_its_log(home):
+    (home / "run.log").touch()
+    with pytest.raises(ProductError, match=rf"the run has no result, see {home / 'run.log'}"):
         read_result(home)
 
 

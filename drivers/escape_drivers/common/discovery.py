@@ -22,7 +22,7 @@ def probe_hosts(
     for where in hosts:
         host, _, port = where.partition(":")
         try:
-            found.append(probe(where, host, int(port) if port.isdigit() else default_port))
+            found.append(probe(where, host, int(port) if port else default_port))
         except DeviceError as error:
             log.info("%s", error)
     return found

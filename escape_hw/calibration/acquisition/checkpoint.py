@@ -26,6 +26,10 @@ log = logging.getLogger(__name__)
 
 #: Differing configuration keys that an error message names.
 _MAX_LISTED = 5
+#: Key of a run's settings with the fingerprint of the matrix that closes the loop.
+CLOSED_WITH = "closed with"
+#: Names of keys in messages.
+_NAMES = {"simulated": "mode (simulated or hardware)", CLOSED_WITH: "control matrix"}
 
 
 class Checkpoint:
@@ -92,7 +96,7 @@ class Checkpoint:
         if saved.get("basis") == fingerprint(np.round(m2c, 9)):
             # As version 0.1.0 wrote it.
             saved["basis"] = self._identity["basis"]
-        _require_same_run(self._resume_path, saved, self._identity)
+        require_same_run(self._resume_path, saved, self._identity)
         bench.rng.bit_generator.state = state.values["rng"]
         return state
 
@@ -128,13 +132,24 @@ def fingerprint(array: NDArray[Any]) -> str:
     return hashlib.sha256(np.ascontiguousarray(array + 0.0).tobytes()).hexdigest()[:16]
 
 
-def _require_same_run(path: Path, saved: Mapping[str, Any], now: Mapping[str, Any]) -> None:
-    """Raise :class:`IncompatibleProduct` unless a saved state is of the same run."""
-    names = {"simulated": "mode (simulated or hardware)"}
-    for key in ("system", "simulated", "method", "settings"):
-        if saved.get(key) != now[key]:
+def require_same_run(path: Path, saved: Mapping[str, Any], now: Mapping[str, Any]) -> None:
+    """Check that a saved state is of the same run, as far as that is known; see :meth:`Checkpoint.begin`.
+
+    ``now`` has the keys of the state's identity that are known: system, settings and configuration, and in
+    full once the devices are open.
+
+    Raises
+    ------
+    IncompatibleProduct
+        It is of another run; the message names the difference.
+    """
+    old_settings = saved.get("settings") or {}
+    pairs = [(key, saved.get(key), now[key]) for key in ("system", "simulated", "method") if key in now]
+    pairs += [(key, old_settings.get(key), value) for key, value in now["settings"].items()]
+    for key, before, value in pairs:
+        if before != value:
             raise IncompatibleProduct(
-                f"{path}: its {names.get(key, key)} is {saved.get(key)!r}, this run's is {now[key]!r}; "
+                f"{path}: its {_NAMES.get(key, key)} is {before!r}, this run's is {value!r}; "
                 "resume with the original settings, or start a new run"
             )
     changed = sorted(_changed_keys(path, str(saved.get("configuration", "")), now["configuration"]))
@@ -144,7 +159,7 @@ def _require_same_run(path: Path, saved: Mapping[str, Any], now: Mapping[str, An
             f"{path}: its configuration differs from this run's in {', '.join(changed[:_MAX_LISTED])}{more}; "
             "resume with the original configuration"
         )
-    if saved.get("basis") != now["basis"]:
+    if "basis" in now and saved.get("basis") != now["basis"]:
         raise IncompatibleProduct(
             f"{path}: its modal basis is not this system's. Version 0.2.0 changed the Karhunen-Loeve modes "
             "of mirrors with many more actuators than modes: finish a run of 0.1.0 with that version, or "

@@ -13,7 +13,7 @@ from escape_hw.api.procedure import Procedure, Progress, Reporter
 from escape_hw.api.results import CalibrationResult
 from escape_hw.api.sensor import SensorGeometry
 from escape_hw.bench import Bench
-from escape_hw.calibration.acquisition.checkpoint import Checkpoint, fingerprint
+from escape_hw.calibration.acquisition.checkpoint import CLOSED_WITH, Checkpoint, fingerprint
 from escape_hw.calibration.acquisition.frames import validate_frame_count
 from escape_hw.calibration.acquisition.pokes import (
     PokeSequence,
@@ -162,7 +162,7 @@ def docrime_closed_run(
     )  # fmt: skip
     method = f"{pattern.method}-closed"
     closed_with = fingerprint(closed_loop.matrix.data)
-    settings = {"poke": poke, "correlations": correlations, "closed with": closed_with}
+    settings = {"poke": poke, "correlations": correlations, CLOSED_WITH: closed_with}
     state = None if checkpoint is None else checkpoint.begin(bench, method, m2c, settings)
     acquisition = ClosedLoopAcquisition(
         bench, closed_loop.matrix, grid, estimator, RunMonitor(checkpoint, criterion)

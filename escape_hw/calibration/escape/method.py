@@ -13,6 +13,7 @@ from escape_hw.api.results import CalibrationResult, RegistrationEstimate
 from escape_hw.api.sensor import SensorGeometry
 from escape_hw.bench import Bench
 from escape_hw.calibration.acquisition.checkpoint import Checkpoint
+from escape_hw.calibration.acquisition.frames import validate_frame_count
 from escape_hw.calibration.acquisition.stopping import Target
 from escape_hw.calibration.docrime.closed_loop import docrime_closed_run
 from escape_hw.calibration.docrime.fit import DocrimeSolution
@@ -22,10 +23,12 @@ from escape_hw.calibration.docrime.open_loop import (
     build_solution_matrix,
     docrime_run,
     minimum_frames,
+    require_enough_frames,
 )
 from escape_hw.calibration.escape.short_runs import (
     calibrate_short_run,
     calibrate_short_run_closed_loop,
+    choose_whitening_order,
     fit_recorded_frames,
 )
 from escape_hw.calibration.modes.bases import build_modal_basis
@@ -99,10 +102,12 @@ def escape(
     """
     c = bench.config.calibration
     from_matrix = _fits_matrix(c, whiten, estimator)
-    n_frames = c.frames if frames is None else frames
+    n_frames = c.frames if frames is None else validate_frame_count(frames)
     n_modes = bench.config.basis.n_modes if closed_loop is None else closed_loop.matrix.n_modes
+    require_enough_frames_for_escape(
+        c, n_modes, frames=n_frames, whiten=whiten, estimator=estimator, until=until, checkpoint=checkpoint
+    )
     if is_short_run(c, n_modes, frames=n_frames, whiten=whiten, estimator=estimator):
-        _require_short_run_options(until, checkpoint, n_frames, minimum_frames(c, n_modes), n_modes)
         if closed_loop is None:
             short = yield from calibrate_short_run(bench, frames=n_frames, poke=poke, grid=grid)
         else:
@@ -160,6 +165,32 @@ def is_short_run(
     return not _fits_matrix(c, whiten, estimator) and n_frames < minimum_frames(c, n_modes)
 
 
+def require_enough_frames_for_escape(
+    c: CalibrationSection,
+    n_modes: int,
+    *,
+    frames: int,
+    whiten: bool = True,
+    estimator: str | None = None,
+    until: Target | None = None,
+    checkpoint: object | None = None,
+) -> None:
+    """Check that a number of frames is enough for the estimator and the options of a run.
+
+    Parameters as for :func:`escape`; ``checkpoint`` is any object if the state is saved or resumed from.
+
+    Raises
+    ------
+    ConfigError, TooFewFrames
+        As :func:`escape`.
+    """
+    if not is_short_run(c, n_modes, frames=frames, whiten=whiten, estimator=estimator):
+        require_enough_frames(c, frames, n_modes, whiten)
+        return
+    _require_short_run_options(until, checkpoint, frames, minimum_frames(c, n_modes), n_modes)
+    choose_whitening_order(c, frames)
+
+
 def _fits_matrix(c: CalibrationSection, whiten: bool, estimator: str | None) -> bool:
     """Whether SPRINT fits the columns of a matrix as modes, rather than the whitened frames."""
     estimator = c.estimator if estimator is None else estimator
@@ -175,7 +206,7 @@ def _fits_matrix(c: CalibrationSection, whiten: bool, estimator: str | None) -> 
 
 
 def _require_short_run_options(
-    until: Target | None, checkpoint: Checkpoint | None, n_frames: int, needed: int, n_modes: int
+    until: Target | None, checkpoint: object | None, n_frames: int, needed: int, n_modes: int
 ) -> None:
     """Raise :class:`ConfigError` for options that need a measured matrix."""
     reason = f"a run of {n_frames} frames is too short for a measured matrix of {n_modes} modes"

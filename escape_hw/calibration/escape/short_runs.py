@@ -69,7 +69,7 @@ def calibrate_short_run(
         Stopped before the last frame.
     """
     c = bench.config.calibration
-    order, poke = _choose_whitening_order(c, frames), c.poke if poke is None else poke
+    order, poke = choose_whitening_order(c, frames), c.poke if poke is None else poke
     m2c = build_modal_basis(bench)
     amplitude = compute_random_amplitudes(bench, m2c, poke)
     acquisition = OpenLoopAcquisition(bench, m2c, grid, min(SETUP_FRAMES, frames), None, store_samples=True)
@@ -118,7 +118,7 @@ def fit_recorded_frames(
     return (yield from fit)
 
 
-def _choose_whitening_order(c: CalibrationSection, frames: int) -> int:
+def choose_whitening_order(c: CalibrationSection, frames: int) -> int:
     """Order of the whitening filter for a number of frames; raises :class:`TooFewFrames`."""
     order = min(c.whiten_order, max(1, validate_frame_count(frames) // _FRAMES_PER_ORDER))
     least = MIN_WHITENED_FRAMES + min(order, 1)
@@ -186,7 +186,7 @@ def calibrate_short_run_closed_loop(
         The loop diverged, the sensor went dark, or it does not respond to the pokes.
     """
     c = bench.config.calibration
-    order, poke = _choose_whitening_order(c, frames), c.poke if poke is None else poke
+    order, poke = choose_whitening_order(c, frames), c.poke if poke is None else poke
     control = build_integrator(bench, closed_loop.matrix, closed_loop.grid)
     loop = RunningLoop.prepare(bench, closed_loop.matrix, closed_loop.grid, control)
     past = 2 * c.whiten_order + c.lags

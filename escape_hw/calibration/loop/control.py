@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import threading
 from dataclasses import dataclass, replace
 from typing import Any
@@ -17,6 +16,7 @@ from escape_hw.api.sensor import SensorGeometry, SlopeFunction
 from escape_hw.bench import Bench
 from escape_hw.calibration.acquisition.sensor_setup import build_slope_function
 from escape_hw.config import layouts
+from escape_hw.config.system import MAX_GAIN
 from escape_hw.errors import ConfigError, IncompatibleProduct
 from escape_hw.pipeline.control.integrator import LeakyIntegrator
 from escape_hw.pipeline.control.reconstructor import reconstructor
@@ -47,7 +47,7 @@ def build_integrator(
     Raises
     ------
     ConfigError
-        The gain is not positive, or the leak is outside [0, 1].
+        The gain is outside (0, :data:`~escape_hw.config.system.MAX_GAIN`], or the leak outside [0, 1].
     IncompatibleProduct
         The matrix belongs to another mirror or geometry.
     CalibrationError
@@ -56,8 +56,11 @@ def build_integrator(
     c = bench.config.loop
     gain = c.gain if gain is None else gain
     leak = c.leak if leak is None else leak
-    if not (0 < gain < math.inf and 0 <= leak <= 1):
-        raise ConfigError(f"gain is {gain} and leak {leak}; the gain must be positive, the leak in [0, 1]")
+    if not (0 < gain <= MAX_GAIN and 0 <= leak <= 1):
+        raise ConfigError(
+            f"gain is {gain} and leak {leak}; the gain must be positive and at most {MAX_GAIN:g}, the leak "
+            "in [0, 1]"
+        )
     if matrix.m2c.shape[0] != bench.dm.info.n_act or matrix.n_slopes != grid.n_slopes:
         raise IncompatibleProduct(
             f"the matrix is for {matrix.m2c.shape[0]} actuators and {matrix.n_slopes} slopes; "

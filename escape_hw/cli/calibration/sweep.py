@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -16,24 +17,29 @@ from escape_hw.cli.context import CommandContext
 from escape_hw.errors import ConfigError
 
 if TYPE_CHECKING:
+    from escape_hw.api.optical_gains import GainsResult
     from escape_hw.bench import Bench
+    from escape_hw.config.system import SystemConfig
+    from escape_hw.io.fits.matrix import MatrixProduct
     from escape_hw.io.run_folder import RunFolder
     from escape_hw.runtime.session.record import BenchRecord
     from escape_hw.runtime.sweep.description import SweepDescription
-    from escape_hw.runtime.sweep.design import MatrixVariant
+    from escape_hw.runtime.sweep.design import Design, MatrixVariant
     from escape_hw.runtime.sweep.result import SweepResult
+    from escape_hw.runtime.sweep.search_space import Parameter
+    from escape_hw.runtime.sweep.workers import Workers
 
 
 @dataclass(frozen=True, slots=True)
 class _Request:
-    """The options of a new sweep; ``counts`` are the fields of its design."""
+    """A new sweep as its options say, with its files; without products, the matrices are measured first."""
 
-    im: tuple[Path, ...]
-    gains: Path | None
-    vary: tuple[str, ...]
-    counts: tuple[int, int, int, int]
+    products: list[MatrixProduct]
+    gains: GainsResult | None
+    space: tuple[Parameter, ...]
+    design: Design
     frames: int
-    calibration_frames: int | None
+    calibration_frames: int
     study: dict[str, Any]
     force: bool
 
@@ -112,35 +118,75 @@ def sweep(
     out: options.Out = None,
 ) -> None:
     """Compare matrices, each at its own best gain, leak and number of modes, on the same turbulence."""
-    from escape_hw.runtime.sweep.request import parse_search_space, require_loop_frames, require_optuna
+    from escape_hw.runtime.sweep.request import require_optuna
 
     require_optuna()
     if bool(selection.system) == bool(resume):
         raise ConfigError("name a system (see 'escape systems') or a run with --resume, one of the two")
-    ranges = {"gain": gain, "leak": leak, "dropped_modes": dropped_modes, "delay": delay}
-    request = _Request(
-        tuple(im or ()), gains,
-        (*(f"{key}={text}" for key, text in ranges.items() if text is not None), *(vary or ())),
-        (trials, candidates, replicates, final_replicates),
-        frames, calibration_frames,
-        dict(sampler=sampler, metric=metric, margin=margin / 100, storage=storage, study=study),
-        force,
-    )  # fmt: skip
-    if resume is not None:
-        selection = replace(selection, system=str(resume / "config.toml"))
-    config = context.load_config(selection)
-    resumed = None
-    if resume is None:
-        parse_search_space(config, request.vary)
-        require_loop_frames(config, frames)
-    else:
-        from escape_hw.runtime.sweep.description import read_description
+    from escape_hw.runtime.sweep.description import read_description
+    from escape_hw.runtime.sweep.design import Design
+    from escape_hw.runtime.sweep.workers import open_workers
 
-        resumed = read_description(resume, storage)
-        if _show_finished(context, resume, resumed):
+    given: SweepDescription | _Request
+    if resume is not None:
+        given = read_description(resume, storage)
+        config = context.load_config(selection := replace(selection, system=str(resume / "config.toml")))
+        if _show_finished(context, resume, given):
             return
-    with context.run_folder(config, "sweep", out) as folder:
-        _run(context, selection, resumed or request, folder, workers, scheduler)
+    else:
+        config = context.load_config(selection)
+        ranges = {"gain": gain, "leak": leak, "dropped_modes": dropped_modes, "delay": delay}
+        given = _read_request(
+            config, im or (), gains,
+            (*(f"{key}={text}" for key, text in ranges.items() if text is not None), *(vary or ())),
+            Design(trials, candidates, replicates, final_replicates), frames, calibration_frames,
+            dict(sampler=sampler, metric=metric, margin=margin / 100, storage=storage, study=study),
+            force,
+        )  # fmt: skip
+    # The workers are opened first: a scheduler that does not answer is found before the calibrations.
+    with (
+        context.run_folder(config, "sweep", out) as folder,
+        closing(open_workers(workers, scheduler)) as pool,
+    ):
+        _run(context, selection, given, folder, pool)
+
+
+def _read_request(
+    config: SystemConfig,
+    im: Sequence[Path],
+    gains: Path | None,
+    vary: Sequence[str],
+    design: Design,
+    frames: int,
+    calibration_frames: int | None,
+    study: dict[str, Any],
+    force: bool,
+) -> _Request:
+    """Check the options of a new sweep and read its files, before any device is opened."""
+    from escape_hw.calibration.docrime.open_loop import require_enough_frames
+    from escape_hw.io.fits.gains import load_gains
+    from escape_hw.runtime.procedures.matrix_input import load_fitting_matrix
+    from escape_hw.runtime.sweep.description import new_description
+    from escape_hw.runtime.sweep.design import MatrixVariant
+    from escape_hw.runtime.sweep.request import parse_search_space, require_loop_frames
+
+    space = parse_search_space(config, vary)
+    require_loop_frames(config, frames)
+    if gains is not None and not im:
+        raise ConfigError("--gains needs --im: optical gains belong to existing matrices")
+    products = [load_fitting_matrix(path, config, force) for path in im]
+    variants = [MatrixVariant(one.path.stem, False, one.path, one.sha256) for one in products]
+    storage = study["storage"] or "sqlite://"
+    new_description(
+        config, variants, space, design,
+        frames=frames, simulated=config.simulated, **{**study, "storage": storage},
+    )  # fmt: skip
+    c = config.calibration
+    calibration_frames = c.frames if calibration_frames is None else calibration_frames
+    if not products:
+        require_enough_frames(c, calibration_frames, config.basis.n_modes)
+    optical_gains = None if gains is None else load_gains(gains).result
+    return _Request(products, optical_gains, space, design, frames, calibration_frames, study, force)
 
 
 def _run(
@@ -148,23 +194,26 @@ def _run(
     selection: options.SystemSelection,
     sweep: SweepDescription | _Request,
     folder: RunFolder,
-    workers: int,
-    scheduler: str | None,
+    pool: Workers,
 ) -> None:
     """Run a new sweep or what is left of one, and save its result in the folder."""
     from escape_hw.runtime.session.record import BenchRecord
+    from escape_hw.runtime.sweep.matrices import read_variants
     from escape_hw.runtime.sweep.result import sweep_and_analyse
-    from escape_hw.runtime.sweep.workers import open_workers
 
+    variants: list[MatrixVariant] = []
+    if isinstance(sweep, _Request) and sweep.products:
+        variants = read_variants(sweep.products, sweep.gains, folder.path)
     with context.bench(selection) as bench:
         record = BenchRecord.from_bench(bench)
         description = (
-            _describe(context, sweep, bench, folder, record) if isinstance(sweep, _Request) else sweep
+            _describe(context, sweep, variants, bench, folder, record)
+            if isinstance(sweep, _Request)
+            else sweep
         )
         if not bench.simulated:
             result, stop = context.run_keeping_partial(sweep_and_analyse(description, bench))
     if description.sweep.simulated:
-        pool = open_workers(workers, scheduler)
         result, stop = context.run_keeping_partial(sweep_and_analyse(description, pool))
     with context.protect_saving(stop):
         _save(context, folder, record, description, result)
@@ -188,42 +237,33 @@ def _show_finished(context: CommandContext, run: Path, description: SweepDescrip
 
 
 def _describe(
-    context: CommandContext, request: _Request, bench: Bench, folder: RunFolder, record: BenchRecord
+    context: CommandContext,
+    request: _Request,
+    variants: list[MatrixVariant],
+    bench: Bench,
+    folder: RunFolder,
+    record: BenchRecord,
 ) -> SweepDescription:
-    """Measure or read the matrices of a new sweep, and save its description in the folder."""
+    """Save the description of a new sweep in the folder; its matrices are measured if there are none."""
+    from escape_hw.runtime.procedures.matrix_input import require_hardware_matrix
     from escape_hw.runtime.sweep.description import describe_sweep
-    from escape_hw.runtime.sweep.design import Design
-    from escape_hw.runtime.sweep.request import parse_search_space
+    from escape_hw.runtime.sweep.matrices import measure_variants, save_variants
 
-    variants = _prepare_variants(context, request, bench, folder, record)
-    space, design = parse_search_space(bench.config, request.vary), Design(*request.counts)
+    for product in request.products:
+        require_hardware_matrix(product, bench, request.force)
+    if not variants:
+        frames = request.calibration_frames
+        gain_frames = frames if bench.config.sensor.kind == "pyramid" else 0
+        measured = context.run(measure_variants(bench, frames=frames, gain_frames=gain_frames))
+        variants = save_variants(folder, record, measured)
     description = context.run(
-        describe_sweep(bench, folder.path, variants, space, design, frames=request.frames, **request.study)
-    )
+        describe_sweep(
+            bench, folder.path, variants, request.space, request.design,
+            frames=request.frames, **request.study,
+        )
+    )  # fmt: skip
     description.save(folder.path)
     return description
-
-
-def _prepare_variants(
-    context: CommandContext, request: _Request, bench: Bench, folder: RunFolder, record: BenchRecord
-) -> list[MatrixVariant]:
-    from escape_hw.io.fits.gains import load_gains
-    from escape_hw.runtime.procedures.matrix_input import load_fitting_matrix, require_hardware_matrix
-    from escape_hw.runtime.sweep.matrices import measure_variants, read_variants, save_variants
-
-    config = bench.config
-    if request.im:
-        products = [load_fitting_matrix(path, config, request.force) for path in request.im]
-        for product in products:
-            require_hardware_matrix(product, bench, request.force)
-        gains = None if request.gains is None else load_gains(request.gains).result
-        return read_variants(products, gains, folder.path)
-    if request.gains is not None:
-        raise ConfigError("--gains needs --im: optical gains belong to existing matrices")
-    frames = request.calibration_frames or config.calibration.frames
-    pyramid = config.sensor.kind == "pyramid"
-    measured = context.run(measure_variants(bench, frames=frames, gain_frames=frames if pyramid else 0))
-    return save_variants(folder, record, measured)
 
 
 def _save(

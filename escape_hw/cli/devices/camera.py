@@ -4,18 +4,24 @@ from __future__ import annotations
 
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
 from escape_hw.cli import options
 from escape_hw.cli.command import command
 from escape_hw.cli.context import DEVICE_CLOSING, CommandContext
-from escape_hw.cli.devices.device_tools import DeviceCommand, SelectedDevice, select_device
+from escape_hw.cli.devices.device_tools import (
+    DeviceCommand,
+    SelectedDevice,
+    check_number,
+    select_device,
+)
 from escape_hw.errors import ConfigError, EscapeError
 
 if TYPE_CHECKING:
     from escape_hw.api.camera import Camera, CameraInfo, CameraSettings, Frame, Region
+    from escape_hw.config.devices import CameraConfig
     from escape_hw.config.system import SystemConfig
 
 app = typer.Typer(
@@ -49,8 +55,7 @@ def snap(
 
     chosen = _camera(context, selection, camera)
     device = chosen.device
-    if chosen.section is not None:
-        _require_room(out, frames, chosen.section.settings().region)
+    _require_room(out, frames, None if chosen.section is None else chosen.section.settings().region)
     recorded: list[Frame] = []
     stop: EscapeError | None = None
     with context.open_protected(device, DEVICE_CLOSING):
@@ -135,11 +140,12 @@ def settings(
     """Check settings, then set them; shows the settings in force, as TOML to paste."""
     chosen = _camera(context, selection, camera)
     device = chosen.device
+    changes = _requested_changes(chosen, exposure, rate, gain, region)
     if not check:
         chosen.announce_change(context, "exposure, frame rate, gain and region")
     with context.open_protected(device, DEVICE_CLOSING):
         base = device.settings if chosen.section is None else chosen.section.settings()
-        requested = _requested_settings(base, exposure, rate, gain, region)
+        requested = replace(base, **changes)
         achievable = device.check(requested)
         now = achievable if check else device.configure(requested)
         info = device.info
@@ -158,14 +164,17 @@ def _camera(context: CommandContext, selection: options.SystemSelection, key: st
     return select_device(context, selection, key, Camera)  # type: ignore[type-abstract]
 
 
-def _require_room(out: Path | None, frames: int, region: Region) -> None:
-    """Refuse a recording that would overwrite a file, or that disk or memory cannot hold."""
+def _require_room(out: Path | None, frames: int, region: Region | None) -> None:
+    """Refuse a recording that would overwrite a file, or that disk or memory cannot hold.
+
+    Without a system the region is known only when the camera is open.
+    """
     from escape_hw.io.fits.file import partial_path
     from escape_hw.io.storage import check_writable, make_folder, refuse_existing
     from escape_hw.runtime.host.computer import Host
 
     # Counts of 16 bits.
-    size = 2 * frames * region.width * region.height
+    size = 0 if region is None else 2 * frames * region.width * region.height
     available = Host().available_memory()
     if available is not None and _COPIES * size > available:
         raise ConfigError(
@@ -197,23 +206,38 @@ def _apply_configuration(
     return chosen.device.configure(requested), True
 
 
-def _requested_settings(
-    base: CameraSettings, exposure: float | None, rate: float | None, gain: float | None, region: str | None
-) -> CameraSettings:
-    """The configured settings with the options applied."""
+def _requested_changes(
+    chosen: SelectedDevice[Camera],
+    exposure: float | None,
+    rate: float | None,
+    gain: float | None,
+    region: str | None,
+) -> dict[str, Any]:
+    """The settings that the options give, within what any camera has, and this one as configured."""
+    changes: dict[str, Any] = {
+        "exposure_s": check_number("--exposure", exposure, 1e-6, 60, "s"),
+        "frame_rate_hz": check_number("--frame-rate", rate, 0.01, 20000, "Hz"),
+        "gain_db": check_number("--gain", gain, 0, 48, "dB"),
+        "region": None if region is None else _parse_region(region, chosen.section),
+    }
+    return {name: value for name, value in changes.items() if value is not None}
+
+
+def _parse_region(text: str, section: CameraConfig | None) -> Region:
+    """A region that lies on the sensor, as far as it is known."""
     from escape_hw.api.camera import Region
 
-    if region is not None:
-        parts = region.split(",")
-        if len(parts) != 4 or not all(part.strip().isdigit() for part in parts):
-            raise ConfigError(f"--region {region}: write X,Y,WIDTH,HEIGHT in integer pixels")
-        base = replace(base, region=Region(*map(int, parts)))
-    return replace(
-        base,
-        exposure_s=base.exposure_s if exposure is None else exposure,
-        frame_rate_hz=base.frame_rate_hz if rate is None else rate,
-        gain_db=base.gain_db if gain is None else gain,
-    )
+    parts = text.split(",")
+    if len(parts) != 4 or not all(part.strip().isdecimal() for part in parts):
+        raise ConfigError(f"--region {text}: write X,Y,WIDTH,HEIGHT in integer pixels")
+    region = Region(*map(int, parts))
+    if min(region.width, region.height) < 1:
+        raise ConfigError(f"--region {text}: width and height must be at least 1 pixel")
+    if section is not None:
+        columns, rows = section.sensor_px
+        if region.x + region.width > columns or region.y + region.height > rows:
+            raise ConfigError(f"--region {text}: does not lie on the sensor of {columns} x {rows} pixels")
+    return region
 
 
 def _format_toml(settings: CameraSettings) -> list[str]:

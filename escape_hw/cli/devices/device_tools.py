@@ -10,6 +10,7 @@ from typer.core import TyperCommand
 from escape_hw.cli.context import CommandContext
 from escape_hw.cli.options import SystemSelection
 from escape_hw.errors import ConfigError
+from escape_hw.runtime.procedures.declaration import Parameter
 
 if TYPE_CHECKING:
     from escape_hw.api.device import Device
@@ -83,6 +84,12 @@ def select_device(
     context.set_device(selection.driver, serial)
     device = build_standalone_device(selection.driver, kind, **settings)
     return SelectedDevice(key, device, None, f"{selection.driver} {serial}".rstrip())
+
+
+def check_number(option: str, value: float | None, low: float, high: float, unit: str) -> float | None:
+    """The number of an option, ``None`` if it is not given; :class:`ConfigError` if it is out of range."""
+    checked: float | None = Parameter(option, "float", low=low, high=high, unit=unit).check(value)
+    return checked
 
 
 def _parse_settings(changes: tuple[str, ...]) -> dict[str, Any]:

@@ -32,7 +32,6 @@ def discover(
         context.show(f"# {device.kind}: {device.model}, serial number {serial}, at {device.where}{used}")
         context.show(device.toml, "")
     if not found:
-        context.notify(
-            "no device was found; check permissions with 'escape doctor', name network hosts with --host"
-        )
+        hosts = f"none answers on {', '.join(host)}" if host else "name network hosts with --host"
+        context.notify(f"no device was found; check permissions with 'escape doctor', {hosts}")
     context.report(met=bool(found), devices=[asdict(device) for device in found])

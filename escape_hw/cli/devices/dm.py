@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -12,16 +13,17 @@ from escape_hw.cli import options
 from escape_hw.cli.command import command
 from escape_hw.cli.context import CommandContext
 from escape_hw.cli.devices.device_tools import DeviceCommand, SelectedDevice, select_device
-from escape_hw.errors import ConfigError
+from escape_hw.errors import CommandRejected, ConfigError
 
 if TYPE_CHECKING:
     from escape_hw.api.mirror import DeformableMirror
-    from escape_hw.config.system import SystemConfig
 
 app = typer.Typer(
     help="Flatten, poke or query the deformable mirror; simulated or real.", no_args_is_help=True
 )
 Seconds = Annotated[float, typer.Option("--seconds", min=0, max=3600, help="Duration; flat afterwards.")]
+#: Part of a wave's commands that may be missed, as by a busy computer.
+_TOLERATED_MISSES = 0.1
 
 
 @app.command("flat", cls=DeviceCommand)
@@ -50,12 +52,11 @@ def poke(
     seconds: Seconds = 1.0,
 ) -> None:
     """Poke one actuator for a while: MOVES the mirror, flat before and after."""
-    chosen = _mirror(context, selection)
-    dm = chosen.device
-    if chosen.config is not None:
-        _require_actuator(chosen.config, actuator, amplitude)
     from escape_hw.runtime.host.device_tools import hold_shape, poke_shape
 
+    chosen = _mirror(context, selection)
+    dm = chosen.device
+    _require_legal(chosen, lambda mirror: poke_shape(mirror, actuator, amplitude))
     chosen.announce_change(context, f"flat, then actuator {actuator} by {amplitude:g} for {seconds:g} s")
     _preserve_floating(dm)
     with context.open_protected(dm):
@@ -77,11 +78,15 @@ def wave(
     waves: Annotated[float, typer.Option("--waves", min=0, max=20, help="Periods across.")] = 2.0,
     seconds: Seconds = 4.0,
 ) -> None:
-    """Run a wave over the mirror: MOVES every actuator, flat before and after."""
-    from escape_hw.runtime.host.device_tools import run_wave, wave_generator
+    """Run a wave over the mirror: MOVES every actuator, flat before and after.
+
+    Exit code 1: fewer commands were sent than the wave has, because the mirror or this computer is too slow.
+    """
+    from escape_hw.runtime.host.device_tools import WAVE_HZ, run_wave, wave_generator
 
     chosen = _mirror(context, selection)
     dm = chosen.device
+    _require_legal(chosen, lambda mirror: wave_generator(mirror, amplitude, waves))
     chosen.announce_change(context, f"a wave of {amplitude:g} at {frequency:g} Hz for {seconds:g} s")
     _preserve_floating(dm)
     with context.open_protected(dm):
@@ -92,7 +97,17 @@ def wave(
     context.show(
         f"{info.model} {info.serial}: {motion.commands} commands, largest {motion.peak:.4g}, then flat"
     )
-    context.report(simulated=info.simulated, serial=info.serial, changed=True, asked=asked, **asdict(motion))
+    total = motion.commands + motion.missed
+    met = motion.missed <= _TOLERATED_MISSES * total
+    if not met:
+        context.notify(
+            f"{motion.missed} of {total} commands were not sent in {seconds:g} s, and the wave was slower "
+            f"than {frequency:g} Hz: the mirror or this computer is too slow for {WAVE_HZ:g} commands per "
+            "second"
+        )
+    context.report(
+        met, simulated=info.simulated, serial=info.serial, changed=True, asked=asked, **asdict(motion)
+    )
 
 
 @app.command("status", cls=DeviceCommand)
@@ -140,14 +155,16 @@ def _preserve_floating(dm: DeformableMirror) -> None:
         dm.leave_set = dm.observe_health().state in (ShellState.SET, ShellState.RUNNING)
 
 
-def _require_actuator(config: SystemConfig, actuator: int, amplitude: float) -> None:
-    """Refuse a poke of a missing or disabled actuator, or beyond the stroke, before anything is opened."""
-    section = config.devices.dm
-    if actuator >= section.n_act:
-        raise ConfigError(f"actuator {actuator}: does not exist; the mirror has 0 to {section.n_act - 1}")
-    if actuator in section.limits.disabled:
-        raise ConfigError(f"actuator {actuator}: disabled (devices.dm.limits.disabled)")
-    if not abs(amplitude) <= section.limits.max_stroke:
-        raise ConfigError(
-            f"amplitude {amplitude:g}: exceeds devices.dm.limits.max_stroke, {section.limits.max_stroke}"
-        )
+def _require_legal(
+    chosen: SelectedDevice[DeformableMirror], shape_of: Callable[[DeformableMirror], object]
+) -> None:
+    """Refuse a shape beyond the limits of the configuration, if there is one, before the device is opened."""
+    from escape_hw.runtime.host.device_tools import ConfiguredMirror
+
+    if chosen.config is None:
+        return
+    with ConfiguredMirror(chosen.config.devices.dm) as mirror:
+        try:
+            shape_of(mirror)
+        except CommandRejected as error:
+            raise ConfigError(str(error)) from error

@@ -12,7 +12,12 @@ import typer
 from escape_hw.cli import options
 from escape_hw.cli.command import command
 from escape_hw.cli.context import DEVICE_CLOSING, CommandContext
-from escape_hw.cli.devices.device_tools import DeviceCommand, SelectedDevice, select_device
+from escape_hw.cli.devices.device_tools import (
+    DeviceCommand,
+    SelectedDevice,
+    check_number,
+    select_device,
+)
 from escape_hw.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -127,6 +132,8 @@ def _requested_modulation(
 
     if radius is not None and radius_rad is not None:
         raise ConfigError("--radius and --radius-rad exclude each other; give one")
+    frequency_hz = check_number("--frequency", frequency_hz, 1e-3, 5000, "Hz")
+    radius_rad = check_number("--radius-rad", radius_rad, 0, 0.1, "rad")
     section: ModulatorConfig | None = chosen.section
     if chosen.config is None or section is None:
         if radius_rad is None or frequency_hz is None:
@@ -135,7 +142,12 @@ def _requested_modulation(
     if radius_rad is None:
         radius = chosen.config.sensor_as(PyramidSection).modulation if radius is None else radius
         radius_rad = radius * section.rad_per_lambda_d
-    return Modulation(radius_rad, frequency_hz or section.frequency_hz)
+    if radius_rad > section.max_tilt_rad:
+        raise ConfigError(
+            f"a radius of {radius_rad / section.rad_per_lambda_d:.4g} lambda/D tilts the stage by "
+            f"{radius_rad:.4g} rad; devices.modulator.max_tilt_rad is {section.max_tilt_rad:g}"
+        )
+    return Modulation(radius_rad, section.frequency_hz if frequency_hz is None else frequency_hz)
 
 
 def _lambda_d(modulation: Modulation, section: ModulatorConfig | None) -> float | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -54,10 +55,16 @@ def _show_run(context: CommandContext, folder: Path) -> None:
         rich_table,
         status_line,
     )
+    from escape_hw.io.run_folder import RESULT_FILE
     from escape_hw.report.content import read_run
     from escape_hw.report.tables import registration_table, rounds_table, strehl_table
     from escape_hw.report.verdict import verdict_document
 
+    resume = _resume_command(folder)
+    if resume and not (folder / RESULT_FILE).is_file():
+        context.show(f"{folder}: a run that is not finished and has no result; resume with: {resume}")
+        context.report(folder=folder.absolute(), resume=resume)
+        return
     run = read_run(folder)
     document = run.document
     context.show(f"{document['command']} on {document['system']}", status_line(run.simulated, run.partial()))
@@ -71,7 +78,19 @@ def _show_run(context: CommandContext, folder: Path) -> None:
         context.show(rich_table(strehl_table(run.loops)))
     context.show(*format_criteria(document.get("criteria", [])), *format_verdict(document))
     context.show(*format_products(document["products"]))
+    if resume and run.partial():
+        context.show(f"this run is not finished; resume with: {resume}")
     context.result({**document, "folder": run.folder, "verdict": verdict_document(document)})
+
+
+def _resume_command(folder: Path) -> str:
+    """The command that resumes an incomplete run; empty if the folder has no state to resume from."""
+    from escape_hw.io.fits.run_state import STATE_FILE
+
+    for name, verb in ((STATE_FILE, "calibrate"), ("sweep.json", "sweep")):
+        if (folder / name).is_file():
+            return shlex.join(("escape", verb, "--resume", str(folder)))
+    return ""
 
 
 @command("compare")

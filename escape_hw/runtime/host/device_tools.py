@@ -6,14 +6,18 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from escape_hw.api.camera import Camera, Frame, FrameStatus
-from escape_hw.api.mirror import DeformableMirror
+from escape_hw.api.mirror import DeformableMirror, DMInfo
 from escape_hw.api.procedure import Procedure, Reporter
 from escape_hw.errors import CommandRejected
+
+if TYPE_CHECKING:
+    from escape_hw.config.devices import MirrorConfig
 
 #: Commands per second of a wave, and seconds over which it rises.
 WAVE_HZ, RISE_S = 100.0, 0.5
@@ -23,11 +27,15 @@ _CHECKED_PHASES = 16
 
 @dataclass(frozen=True, slots=True)
 class DriveResult:
-    """Commands sent, commands that the mirror skipped, and the largest value, fraction of full stroke."""
+    """Commands sent, commands that the mirror skipped, and the largest value, fraction of full stroke.
+
+    ``missed``: commands of a wave that could not be sent in its time.
+    """
 
     commands: int
     skipped: int
     peak: float
+    missed: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,6 +53,28 @@ class CameraStatistics:
     lowest: int
     highest: int
     saturated: int
+
+
+class ConfiguredMirror(DeformableMirror):
+    """The mirror that a configuration describes, without a device: checks shapes before one is opened."""
+
+    def __init__(self, section: MirrorConfig) -> None:
+        super().__init__("dm", section.limits.to_limits())
+        self._info = section.info("configured", simulated=True)
+
+    @property
+    def info(self) -> DMInfo:
+        """Identity and geometry, as configured."""
+        return self._info
+
+    def _open(self) -> None:
+        pass
+
+    def _close(self) -> None:
+        pass
+
+    def _send(self, command: NDArray[np.float64]) -> None:
+        pass
 
 
 def poke_shape(dm: DeformableMirror, actuator: int, amplitude: float) -> NDArray[np.float64]:
@@ -125,21 +155,29 @@ def wave_generator(
 def run_wave(
     dm: DeformableMirror, shape: Callable[[float], NDArray[np.float64]], frequency_hz: float, seconds: float
 ) -> Procedure[DriveResult]:
-    """Run a wave from :func:`wave_generator` over an open mirror, with a slow rise, then flatten."""
-    report = Reporter("wave", max(1, math.ceil(seconds)), "second")
+    """Run a wave from :func:`wave_generator` over an open mirror, with a slow rise, then flatten.
+
+    Each command advances the wave by the same time: a late command slows the wave down, and no shape is
+    farther from the previous one than the frequency says. Commands that are late are not made up for.
+    """
+    report, total = Reporter("wave", max(1, math.ceil(seconds)), "second"), math.ceil(seconds * WAVE_HZ)
     commands = skipped = 0
     peak = 0.0
     flat = dm.flat
     try:
-        started = time.monotonic()
-        while (at := time.monotonic() - started) < seconds:
+        # The first display of the progress takes longer than a command.
+        yield report(0)
+        due = started = time.monotonic()
+        while commands < total and time.monotonic() - started < seconds:
+            at = commands / WAVE_HZ
             sent = dm.send(flat + (shape(frequency_hz * at) - flat) * min(1.0, at / RISE_S))
             commands, skipped = commands + 1, skipped + sent.skipped
             peak = max(peak, float(np.abs(sent.sent).max()))
             if report.is_due():
                 yield report(int(at), commands=commands)
-            time.sleep(max(0.0, started + commands / WAVE_HZ - time.monotonic()))
-        return DriveResult(commands, skipped, peak)
+            due = max(due + 1 / WAVE_HZ, time.monotonic())
+            time.sleep(max(0.0, due - time.monotonic()))
+        return DriveResult(commands, skipped, peak, total - commands)
     finally:
         dm.flatten()
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import cast
 
 from escape_hw.api.discovery import DiscoveredDevice, Discoverer, device_section_toml
+from escape_hw.errors import ConfigError
 from escape_hw.runtime.host.computer import Host, UsbDevice
 
 GROUP = "escape.discover"
@@ -29,12 +30,26 @@ def discover(hosts: Sequence[str] = (), host: Host | None = None) -> list[Discov
     """Devices on USB, on serial lines, with ALPAO files, and those that drivers find on the given hosts.
 
     ``hosts`` are queried as ``name`` or ``name:port``; the network is never scanned.
+
+    Raises
+    ------
+    ConfigError
+        A host has neither form.
     """
+    for where in hosts:
+        _require_host(where)
     host = host or Host()
     found = [*_find_usb(host), *_find_serial(host), *_find_alpao(host)]
     for entry in sorted(importlib.metadata.entry_points(group=GROUP), key=lambda one: one.name):
         found += cast(Discoverer, entry.load())(hosts)
     return found
+
+
+def _require_host(where: str) -> None:
+    name, colon, port = where.partition(":")
+    is_port = port.isdecimal() and 1 <= int(port) <= 65535
+    if not name.strip() or (colon and not is_port):
+        raise ConfigError(f"--host {where!r}: write NAME or NAME:PORT, with a port from 1 to 65535")
 
 
 def _find_usb(host: Host) -> Iterator[DiscoveredDevice]:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 from escape_hw.config.choices import ESTIMATORS, POKE_PATTERNS
 from escape_hw.config.renamed import update_document
-from escape_hw.errors import ConfigError, ProductError
+from escape_hw.errors import ConfigError, IncompatibleProduct, ProductError
 from escape_hw.runtime.procedures.declaration import ProcedureSpec, SavedRun, parameter, present_names
 from escape_hw.runtime.procedures.matrix_input import load_fitting_matrix, require_hardware_matrix
 from escape_hw.runtime.procedures.sprint import SprintParameters
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from escape_hw.bench import Bench
     from escape_hw.calibration.acquisition.checkpoint import Checkpoint
     from escape_hw.calibration.acquisition.stopping import Target
-    from escape_hw.config.system import SystemConfig
+    from escape_hw.config.system import CalibrationSection, SystemConfig
     from escape_hw.io.fits.matrix import MatrixProduct
     from escape_hw.io.run_folder import RunFolder
     from escape_hw.runtime.session.record import BenchRecord
@@ -144,6 +144,35 @@ class CalibrationProcedure(ProcedureSpec["CalibrationResult"]):
         """Whether the run is too short for a measured matrix, so that it cannot be resumed."""
         return False
 
+    def load(self, config: SystemConfig, simulated: bool = False) -> None:
+        """Refuse too few frames, and a state to resume from that is of another run."""
+        control, c = self._control_matrix, config.calibration
+        self._require_enough_frames(c, config.basis.n_modes if control is None else control.matrix.n_modes)
+        if self.resume is None:
+            return
+        from escape_hw.calibration.acquisition.checkpoint import require_same_run
+        from escape_hw.io.fits.run_state import STATE_FILE, load_state
+
+        method, path = saved_request(self.resume)["method"], self.resume / STATE_FILE
+        if method != self.name:
+            raise IncompatibleProduct(
+                f"{path}: its method is {method!r}, this run's is {self.name!r}; resume with that method, or "
+                "start a new run"
+            )
+        now = {
+            "system": config.system.name,
+            "settings": self._settings_to_resume(c),
+            "configuration": config.to_toml(),
+        }
+        require_same_run(path, load_state(path).identity, now)
+
+    def _require_enough_frames(self, c: CalibrationSection, n_modes: int) -> None:
+        """Raise :class:`TooFewFrames` for a run that cannot give a result."""
+
+    def _settings_to_resume(self, c: CalibrationSection) -> dict[str, Any]:
+        """Settings of the saved state that must be the same, as far as they are known without a bench."""
+        return {}
+
     def procedure(self, bench: Bench, folder: RunFolder | None) -> Procedure[CalibrationResult]:
         """Calibrate; the state is saved in the folder meanwhile, so that the run can be resumed."""
         from escape_hw.calibration.acquisition.checkpoint import Checkpoint
@@ -220,6 +249,13 @@ class ClosedLoopCalibration(CalibrationProcedure):
         """Read the control matrix."""
         if self.closed_loop is not None:
             self._control_matrix = load_fitting_matrix(self.closed_loop, config, self.force or simulated)
+        super().load(config, simulated)
+
+    def _settings_to_resume(self, c: CalibrationSection) -> dict[str, Any]:
+        from escape_hw.calibration.acquisition.checkpoint import CLOSED_WITH, fingerprint
+
+        control = self._control_matrix
+        return {CLOSED_WITH: None if control is None else fingerprint(control.matrix.data)}
 
 
 class DocrimeProcedure(ClosedLoopCalibration):
@@ -247,6 +283,15 @@ class DocrimeProcedure(ClosedLoopCalibration):
     def method_options(self) -> dict[str, Any]:
         """Whether the turbulence is whitened."""
         return {"whiten": self.whiten}
+
+    def _require_enough_frames(self, c: CalibrationSection, n_modes: int) -> None:
+        from escape_hw.calibration.docrime.open_loop import require_enough_frames
+
+        require_enough_frames(c, c.frames if self.frames is None else self.frames, n_modes, self.whiten)
+
+    def _settings_to_resume(self, c: CalibrationSection) -> dict[str, Any]:
+        settings = {**super()._settings_to_resume(c), "poke": c.poke if self.poke is None else self.poke}
+        return settings if self.closed_loop is not None else {**settings, "whiten": self.whiten}
 
 
 class EscapeProcedure(DocrimeProcedure, SprintParameters["CalibrationResult"]):
@@ -276,6 +321,16 @@ class EscapeProcedure(DocrimeProcedure, SprintParameters["CalibrationResult"]):
         """Whether the turbulence is whitened, and the data that are fitted."""
         return {"whiten": self.whiten, "estimator": self.estimator}
 
+    def _require_enough_frames(self, c: CalibrationSection, n_modes: int) -> None:
+        from escape_hw.calibration.acquisition.stopping import Target
+        from escape_hw.calibration.escape.method import require_enough_frames_for_escape
+
+        require_enough_frames_for_escape(
+            c, n_modes, frames=c.frames if self.frames is None else self.frames,
+            until=None if self.target == (None, None) else Target(*self.target), checkpoint=self.resume,
+            **self.method_options(),
+        )  # fmt: skip
+
     def _is_short_run(self, bench: Bench) -> bool:
         from escape_hw.calibration.escape.method import is_short_run
 
@@ -293,6 +348,12 @@ class PushPullProcedure(CalibrationProcedure):
 
     frames: int | None = _frames("calibration.push_pull_frames", "Frames per push and per pull.")
     poke: float | None = _poke("calibration.push_pull_poke")
+
+    def _settings_to_resume(self, c: CalibrationSection) -> dict[str, Any]:
+        return {
+            "poke": c.push_pull_poke if self.poke is None else self.poke,
+            "frames": c.push_pull_frames if self.frames is None else self.frames,
+        }
 
     @classmethod
     def preparation_frames(cls, bench: Bench, arguments: Mapping[str, Any]) -> int:
@@ -318,6 +379,15 @@ class FastPushPullProcedure(ClosedLoopCalibration):
 
     poke: float | None = _poke("calibration.push_pull_poke")
 
+    def _require_enough_frames(self, c: CalibrationSection, n_modes: int) -> None:
+        from escape_hw.calibration.docrime.open_loop import require_enough_frames
+
+        require_enough_frames(c, c.frames if self.frames is None else self.frames, n_modes)
+
+    def _settings_to_resume(self, c: CalibrationSection) -> dict[str, Any]:
+        poke = c.push_pull_poke if self.poke is None else self.poke
+        return {**super()._settings_to_resume(c), "poke": poke}
+
 
 class ModulatedProcedure(CalibrationProcedure):
     """Modulation-demodulation: several modes at once, on distinct frequencies."""
@@ -327,6 +397,16 @@ class ModulatedProcedure(CalibrationProcedure):
     help = "Measure an interaction matrix with several modes at once, each at its own frequency."
 
     frames: int | None = _frames("calibration.modulated_frames", "Frames per batch of modes.")
+
+    def _require_enough_frames(self, c: CalibrationSection, n_modes: int) -> None:
+        from escape_hw.calibration.push_pull.demodulation import choose_line_frequencies
+        from escape_hw.calibration.push_pull.modulation import BAND
+
+        choose_line_frequencies(n_modes, self._settings_to_resume(c)["frames"], BAND)
+
+    def _settings_to_resume(self, c: CalibrationSection) -> dict[str, Any]:
+        # The poke that is saved is limited by the mirror.
+        return {"frames": c.modulated_frames if self.frames is None else self.frames}
 
     @classmethod
     def preparation_frames(cls, bench: Bench, arguments: Mapping[str, Any]) -> int:

@@ -276,6 +276,15 @@ class ProcedureSpec(ABC, Generic[ResultT]):
             A file is damaged, or belongs to another system.
         """
 
+    def require_first(self, config: SystemConfig) -> None:
+        """Check, before any device is opened, what a procedure needs that is the first on a new bench.
+
+        Raises
+        ------
+        ConfigError
+            It needs the result of another procedure, which the configuration does not name.
+        """
+
     @abstractmethod
     def procedure(self, bench: Bench, folder: RunFolder | None) -> Procedure[ResultT]:
         """The generator that does the work, on an open bench with the configuration given to :meth:`load`.

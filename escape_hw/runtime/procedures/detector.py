@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from escape_hw.errors import ConfigError
 from escape_hw.runtime.procedures.declaration import ProcedureSpec, SavedRun, parameter
 
 if TYPE_CHECKING:
@@ -13,6 +14,7 @@ if TYPE_CHECKING:
 
     from escape_hw.api.procedure import Procedure
     from escape_hw.bench import Bench
+    from escape_hw.config.system import SystemConfig
     from escape_hw.io.run_folder import RunFolder
     from escape_hw.runtime.session.record import BenchRecord
 
@@ -79,6 +81,14 @@ class FlatProcedure(_PixelProcedure):
     help = "Measure the relative response of the pixels in uniform light, after the dark frame."
 
     frames: int = parameter(default=100, help="Frames to average.", unit="frame", low=1, high=1e6)
+
+    def require_first(self, config: SystemConfig) -> None:
+        """Refuse a configuration without a dark frame."""
+        if not config.devices.wfs.dark_file:
+            raise ConfigError(
+                f"'{config.system.name}' has no dark frame, which a flat needs: measure it with 'escape "
+                "dark', and name its dark.fits in devices.wfs.dark_file"
+            )
 
     def procedure(self, bench: Bench, folder: RunFolder | None) -> Procedure[PixelCalibration]:
         """Average frames in uniform light."""

@@ -13,14 +13,15 @@ import numpy as np
 from escape_hw.api.procedure import Procedure
 from escape_hw.bench import Bench
 from escape_hw.config.loader import load_text
+from escape_hw.config.system import SystemConfig
 from escape_hw.errors import ConfigError, ProductError
 from escape_hw.io.documents import dumps
 from escape_hw.io.provenance import file_sha256
 from escape_hw.io.storage import write_atomic
 from escape_hw.runtime.procedures.model_psf import model_psf
 from escape_hw.runtime.sweep.design import METRICS, Design, MatrixVariant, Sweep, current_keys
-from escape_hw.runtime.sweep.search_space import DELAY_KEY, Parameter, format_value, parse_parameter
-from escape_hw.runtime.sweep.study import SAMPLERS, SweepStudy, redact_password
+from escape_hw.runtime.sweep.search_space import DELAY_KEY, Choices, Parameter, format_value, parse_parameter
+from escape_hw.runtime.sweep.study import SAMPLERS, SweepStudy, redact_password, require_storage_url
 
 DESCRIPTION_FILE = "sweep.json"
 
@@ -55,6 +56,7 @@ class SweepDescription:
             raise ConfigError(f"--margin {100 * self.margin:g}: it must be positive")
         if design.trials < len(sweep.variants):
             raise ConfigError(f"--trials {design.trials}: fewer than the {len(sweep.variants)} matrices")
+        require_storage_url(self.storage)
         for one in sweep.space:
             _check_limits(sweep, one)
         return self
@@ -127,28 +129,49 @@ def describe_sweep(
     Raises
     ------
     ConfigError
-        See :meth:`SweepDescription.validate`.
+        See :meth:`SweepDescription.validate`; nothing moved.
     """
-    path, psf = folder / "model_psf.npy", None
-    if all("." not in one.key for one in space):
-        psf = str(path)
-        if not path.is_file():
-            np.save(path, (yield from model_psf(bench)))
-    config = bench.config
-    sweep = Sweep(
-        config.to_toml(), tuple(variants), space, design, frames, config.system.seed, metric, psf,
-        bool(bench.simulated),
+    description = new_description(
+        bench.config, variants, space, design, frames=frames, metric=metric, sampler=sampler, margin=margin,
+        storage=storage or f"sqlite:///{folder / 'study.db'}", study=study, simulated=bool(bench.simulated),
     )  # fmt: skip
-    url = storage or f"sqlite:///{folder / 'study.db'}"
-    return SweepDescription(sweep, url, study, sampler, margin).validate()
+    if any("." in one.key for one in space):
+        return description
+    path = folder / "model_psf.npy"
+    if not path.is_file():
+        np.save(path, (yield from model_psf(bench)))
+    return replace(description, sweep=replace(description.sweep, psf=str(path)))
+
+
+def new_description(
+    config: SystemConfig,
+    variants: Sequence[MatrixVariant],
+    space: tuple[Parameter, ...],
+    design: Design,
+    *,
+    frames: int,
+    metric: str,
+    sampler: str,
+    margin: float,
+    storage: str,
+    study: str,
+    simulated: bool,
+) -> SweepDescription:
+    """As :func:`describe_sweep`, without a model PSF; opens nothing."""
+    sweep = Sweep(
+        config.to_toml(), tuple(variants), space, design, frames, config.system.seed, metric,
+        simulated=simulated,
+    )  # fmt: skip
+    return SweepDescription(sweep, storage, study, sampler, margin).validate()
 
 
 def _check_limits(sweep: Sweep, parameter: Parameter) -> None:
-    """Check both ends of a range against the configuration's limits, before anything opens."""
-    for value in (parameter.at(0.0), parameter.at(1.0)):
+    """Check a list, or both ends of a range, against the configuration's limits, before anything opens."""
+    limits = parameter.values if isinstance(parameter, Choices) else (parameter.low, parameter.high)
+    for value in limits:
         if parameter.key == DELAY_KEY:
-            if value < 0:
-                raise ConfigError(f"{DELAY_KEY}: {value:g} must not be negative")
+            if isinstance(value, bool) or not isinstance(value, int | float) or not value >= 0:
+                raise ConfigError(f"{DELAY_KEY}: {value} must be a number of frames that is not negative")
             continue
         path = parameter.key if "." in parameter.key else f"loop.{parameter.key}"
         load_text(sweep.config, "sweep", overrides=[f"{path}={format_value(value)}"])

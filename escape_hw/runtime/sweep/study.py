@@ -12,7 +12,7 @@ import threading
 import time
 import warnings
 import zlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from datetime import datetime
 from typing import Any, Concatenate, ParamSpec, Self, TypeVar
@@ -360,21 +360,39 @@ def redact_password(url: str) -> str:
         return url
 
 
-def _open_study(url: str, name: str, heartbeat: bool) -> tuple[_Storage, optuna.Study]:
-    # A locked file is waited for; a connection that a restarted server has cut is noticed.
-    options: dict[str, Any] = {"pool_pre_ping": True}
-    if url.startswith("sqlite"):
-        options["connect_args"] = {"timeout": 60}
+def require_storage_url(url: str) -> None:
+    """Check that the URL of a storage can be read and its driver is installed; connects to nothing.
+
+    Raises
+    ------
+    ConfigError
+        It cannot, or it is not.
+    """
+    with _invalid_url_is_refused(url):
+        make_url(url).get_dialect().import_dbapi()
+
+
+@contextlib.contextmanager
+def _invalid_url_is_refused(url: str) -> Iterator[None]:
     try:
-        storage = _Storage(
-            url, engine_kwargs=options, heartbeat_interval=HEARTBEAT_S if heartbeat else None,
-            grace_period=GRACE_PERIOD_S,
-        )  # fmt: skip
+        yield
     except (ImportError, ValueError, ArgumentError) as error:
         raise ConfigError(
             f"--storage {redact_password(url)}: {error}; it is of the form sqlite:////path/study.db or "
             "postgresql+psycopg://user@host/database (pip install 'escape-hw[postgresql]')"
         ) from error
+
+
+def _open_study(url: str, name: str, heartbeat: bool) -> tuple[_Storage, optuna.Study]:
+    # A locked file is waited for; a connection that a restarted server has cut is noticed.
+    options: dict[str, Any] = {"pool_pre_ping": True}
+    if url.startswith("sqlite"):
+        options["connect_args"] = {"timeout": 60}
+    with _invalid_url_is_refused(url):
+        storage = _Storage(
+            url, engine_kwargs=options, heartbeat_interval=HEARTBEAT_S if heartbeat else None,
+            grace_period=GRACE_PERIOD_S,
+        )  # fmt: skip
     if url.startswith("sqlite"):
         event.listen(storage.engine, "connect", _enable_write_ahead_log)
         storage.engine.dispose()

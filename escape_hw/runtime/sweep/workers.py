@@ -138,7 +138,7 @@ class DaskWorkers(Workers):
     Raises
     ------
     ConfigError
-        Dask is not installed.
+        Dask is not installed, or the address is not one.
     CalibrationError
         No scheduler answers within :data:`SCHEDULER_TIMEOUT_S` seconds.
     """
@@ -171,6 +171,10 @@ class DaskWorkers(Workers):
                 self._client = self._dask.Client(self.address, timeout=5, set_as_default=False)
                 executor: Executor = self._client.get_executor(pure=False)
                 return executor
+            except ValueError as error:
+                raise ConfigError(
+                    f"--scheduler {self.address}: {error}; it is of the form tcp://host:8786"
+                ) from error
             except (OSError, TimeoutError) as error:
                 if self._closed or time.monotonic() > deadline:
                     raise CalibrationError(

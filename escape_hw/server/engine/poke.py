@@ -69,18 +69,23 @@ class PokeRunner:
         return plan, flat + poke
 
     def _unit_shape(self, request: PokeRequest) -> tuple[NDArray[np.float64], str]:
-        """Shape ``(n_act,)`` whose largest command is 1, and its name; numbers in names count from 1."""
+        """Shape ``(n_act,)`` whose largest command is 1, and its name.
+
+        Names count actuators from 0 and modes from 1, as the configuration and the offsets do.
+        """
         n_act = self._bench.dm.info.n_act
         if request.kind == "actuator":
             if request.number >= n_act:
-                raise RequestRefused(f"actuator {request.number + 1}: the mirror has {n_act}")
+                raise RequestRefused(
+                    f"actuator {request.number} does not exist; the mirror has 0 to {n_act - 1}"
+                )
             if request.number in self._bench.dm.limits.disabled:
-                raise RequestRefused(f"actuator {request.number + 1} is disabled in the configuration")
-            return np.eye(n_act)[request.number], f"actuator {request.number + 1}"
+                raise RequestRefused(f"actuator {request.number} is disabled in the configuration")
+            return np.eye(n_act)[request.number], f"actuator {request.number}"
         m2c = self._owner.modal_basis
         n_modes = m2c.shape[1]
         if request.number >= n_modes:
-            raise RequestRefused(f"mode {request.number + 1}: the basis has {n_modes}")
+            raise RequestRefused(f"mode {request.number + 1} does not exist; the basis has 1 to {n_modes}")
         mode = m2c[:, request.number]
         return mode / np.abs(mode).max(), f"mode {request.number + 1}"
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 import ctypes
 import math
 import os
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,6 +20,7 @@ from numpy.typing import DTypeLike
 
 #: Version written into streams that are made here; readers of another version refuse them.
 VERSION = "2.00"
+_VERSIONS = r"2\.\d\d"
 SEMAPHORES = 10
 #: Maximum count of a semaphore without a waiting reader.
 SEMAPHORE_MAX = 10
@@ -173,7 +175,7 @@ def build_metadata(name: str, shape: tuple[int, ...], dtype: DTypeLike, version:
     Raises
     ------
     ValueError
-        milk has no such name, shape or type.
+        milk has no such name, shape, type or version.
     """
     wanted = np.dtype(dtype).newbyteorder("=")
     codes = [code for code, known in DTYPES.items() if known == wanted]
@@ -183,6 +185,8 @@ def build_metadata(name: str, shape: tuple[int, ...], dtype: DTypeLike, version:
         raise ValueError(f"milk has no images of shape {shape}; one to three axes, none of them empty")
     if not name or "/" in name or len(name.encode()) >= _NAME_BYTES:
         raise ValueError(f"{name!r} is not a valid stream name: no '/', fewer than {_NAME_BYTES} bytes")
+    if not re.fullmatch(_VERSIONS, version):
+        raise ValueError(f"layout {version!r}: versions 2.00 to 2.99 can be written, such as {VERSION}")
     head = Metadata(name=name.encode(), naxis=len(shape), nelement=math.prod(shape), datatype=codes[0])
     for axis, length in enumerate(reversed(shape)):
         head.size[axis] = length

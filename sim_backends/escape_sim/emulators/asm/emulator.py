@@ -102,7 +102,8 @@ class AsmEmulator(Emulator):
         except OSError as error:
             loop.close()
             raise ConfigError(
-                f"cannot listen on {self._host}:{self._port} ({error}); choose another --port, 0 for any"
+                f"cannot listen on {self._host}:{self._port} ({error}); choose another --port (0: any) or "
+                "--host"
             ) from error
         self._loop, self._address = loop, f"tcp {self._host}:{port}"
         self._thread = threading.Thread(target=loop.run_forever, name="asm emulator", daemon=True)

@@ -154,8 +154,8 @@ class TcpServer(E727Server):
             self._listener = listener = socket.create_server((host, port))
         except OSError as error:
             raise ConfigError(
-                f"cannot listen on {host}:{port} ({error.strerror or error}); choose another --port, "
-                "0 for any"
+                f"cannot listen on {host}:{port} ({error.strerror or error}); choose another --port "
+                "(0: any) or --host"
             ) from error
         self._start_thread(lambda: self._serve(listener))
         return f"tcp {listener.getsockname()[0]}:{self.port}"
