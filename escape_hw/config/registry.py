@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib.metadata
 import inspect
 import sys
-import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache, partial
@@ -18,7 +17,7 @@ from escape_hw.api.sensor import SensorGeometry
 from escape_hw.api.synthetic_model import SyntheticModel
 from escape_hw.config.system import SystemConfig
 from escape_hw.deprecation import warn_renamed
-from escape_hw.errors import ConfigError, EscapeError
+from escape_hw.errors import ConfigError, EscapeError, raised_at
 from escape_hw.suggestions import closest_match
 
 T = TypeVar("T")
@@ -70,7 +69,7 @@ def call_factory(what: str, kind: type[T], factory: Callable[..., object], *argu
     except Exception as error:
         raise ConfigError(
             f"{what} cannot be created: {_factory_name(factory)} failed with {type(error).__name__}: {error}"
-            f"{_raised_at(error)}"
+            f"{raised_at(error)}"
         ) from error
     if not isinstance(product, kind):
         raise ConfigError(
@@ -84,11 +83,6 @@ def _factory_name(factory: object) -> str:
     factory = factory.func if isinstance(factory, partial) else factory
     module, name = (getattr(factory, key, "") for key in ("__module__", "__qualname__"))
     return f"{module}:{name}" if module and name else repr(factory)
-
-
-def _raised_at(error: Exception) -> str:
-    frames = traceback.extract_tb(error.__traceback__)
-    return f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno})" if frames else ""
 
 
 DEVICES = "escape.devices"
