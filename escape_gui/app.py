@@ -6,6 +6,7 @@ import logging
 import os
 import signal
 import sys
+import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -26,7 +27,7 @@ from escape_gui.widgets.controls import Level
 from escape_gui.window.closing import is_busy
 from escape_gui.window.export import save_png
 from escape_hw.config.loader import load_system
-from escape_hw.errors import ConfigError
+from escape_hw.errors import ConfigError, EscapeError, ServerGone
 from escape_hw.remote.address import find_server, running_servers
 from escape_hw.remote.state import Phase
 from escape_hw.runtime.host.doctor import missing_qt_libraries
@@ -34,8 +35,8 @@ from escape_hw.runtime.host.doctor import missing_qt_libraries
 log = logging.getLogger(__name__)
 #: System to serve if none is named and no server runs.
 DEFAULT_SYSTEM = "razor-shwfs"
-#: Delay between a ready engine and the screenshot, and longest wait for the engine; milliseconds.
-_SCREENSHOT_DELAY_MS, _SCREENSHOT_TIMEOUT_MS = 4000, 60_000
+#: Delay between a ready engine and the screenshot, milliseconds, and longest wait for the engine, seconds.
+_SCREENSHOT_DELAY_MS, _SCREENSHOT_TIMEOUT_S = 4000, 60.0
 #: Title of the message without a server; it is closed when one answers.
 _NO_SERVER = "No server"
 _ICON = Path(__file__).with_name("escape.svg")
@@ -93,6 +94,8 @@ class WindowController(QObject):
         self.window, self.session = window, session
         self.local_server: LocalServer | None = None
         self._live: LiveSource | None = None
+        #: Why there is no connection yet; empty while it is being made.
+        self.failure = ""
         #: A recorded run on screen when the operator asked for a server, which then takes its place.
         self._left_recording: ReplaySource | None = None
         #: The window is connected, but a recorded run stays on screen.
@@ -132,7 +135,7 @@ class WindowController(QObject):
         self.connect_to(load_system(system).system.name, self._start_server(system))
 
     def _attach(self, address: str, local_server: LocalServer | None) -> None:
-        self.local_server = local_server
+        self.local_server, self.failure = local_server, ""
         self.window.started_server = local_server is not None
         self.attachment = ServerAttachment(address)
         self.attachment.attached.connect(self._attached)
@@ -142,7 +145,7 @@ class WindowController(QObject):
     def _attached(self, live: LiveSource) -> None:
         if self.attachment is None or live is not self.attachment.live:
             return  # of the connection before
-        old, self._live = self._live, live
+        old, self._live, self.failure = self._live, live, ""
         self.window.notifications.close_messages(_NO_SERVER)
         if self._recording is None or self._recording is self._left_recording:
             self._show_server()
@@ -181,7 +184,9 @@ class WindowController(QObject):
         title = _NO_SERVER
         if self.local_server is not None:
             title, reason = "The server did not start", self.local_server.exit_message
-        if reason:
+        # Every attempt fails with a reason; one that is known already is not repeated.
+        known, self.failure = self.failure, reason
+        if reason and reason != known:
             self._stop_waiting()
             self.window.connect_dialog.show_error(reason)
             self.window.notifications.show_message(Level.ERROR, title, reason)
@@ -217,12 +222,16 @@ def run(system: str, address: str, screenshot: Path | None, reset_settings: bool
     Returns
     -------
     int
-        Exit code; 1 for a screenshot without a server.
+        Exit code.
 
     Raises
     ------
     ConfigError
         There is no such system, or no display.
+    ServerGone
+        No server answers, so that there is nothing to save into ``screenshot``.
+    StorageError
+        ``screenshot`` cannot be written.
     """
     require_display()
     qt_app = qt_application()
@@ -239,21 +248,22 @@ def run(system: str, address: str, screenshot: Path | None, reset_settings: bool
     for warning in warnings:
         log.warning("%s", warning)
         window.notifications.show_message(Level.WARNING, "Settings", warning)
-    if screenshot is not None:
-        _take_screenshot(window, session, screenshot)
     controller = WindowController(
         window, session, address, local_server, lambda name: starter.submit(LocalServer, name).result()
     )
     if recording:
         window.show_recording(read_run(Path(system)))
     window.update_timer.start()
-    if screenshot is None:
+    shot = None if screenshot is None else Screenshot(window, controller, screenshot)
+    if shot is None:
         window.fit_to_screen(window.screen().availableGeometry())
     window.show()
     try:
         with _close_on_signals(window):
             code = qt_app.exec()
-        return code if screenshot is None or not isinstance(session.source, EmptySource) else 1
+        if shot is not None and shot.error is not None:
+            raise shot.error
+        return code
     finally:
         session.close()
         controller.close()
@@ -293,20 +303,41 @@ def _close_on_signals(window: MainWindow) -> Iterator[None]:
             signal.signal(number, handler)
 
 
-def _take_screenshot(window: MainWindow, session: Session, path: Path) -> None:
-    """Save an image once the engine has started, and close the window."""
-    poll = QTimer(window)
+class Screenshot(QObject):
+    """Saves an image of a window once the engine has started or a recording is open, and closes the window.
 
-    def take() -> None:
-        save_png(path, window)
-        window.close_without_question()
+    ``error`` is set if there is no server or the file cannot be written.
+    """
 
-    def check() -> None:
-        source = session.source
-        if source.connected and source.state.phase is not Phase.STARTING:
-            poll.stop()
-            QTimer.singleShot(_SCREENSHOT_DELAY_MS, take)
+    def __init__(self, window: MainWindow, controller: WindowController, path: Path) -> None:
+        super().__init__(window)
+        self.error: EscapeError | None = None
+        self._window, self._controller, self._path = window, controller, path
+        self._deadline_s = time.monotonic() + _SCREENSHOT_TIMEOUT_S
+        self._poll = QTimer(self)
+        self._poll.timeout.connect(self._check)
+        self._poll.start(200)
 
-    poll.timeout.connect(check)
-    poll.start(200)
-    QTimer.singleShot(_SCREENSHOT_TIMEOUT_MS, take)
+    def _check(self) -> None:
+        source, late = self._controller.session.source, time.monotonic() > self._deadline_s
+        if isinstance(source, EmptySource):
+            if late or self._controller.failure:
+                reason = self._controller.failure or f"no server within {_SCREENSHOT_TIMEOUT_S:g} s"
+                self.error = ServerGone(reason)
+                self._end()
+        elif late or (source.connected and source.state.phase is not Phase.STARTING):
+            self._poll.stop()
+            QTimer.singleShot(_SCREENSHOT_DELAY_MS, self._take)
+
+    def _take(self) -> None:
+        # Qt swallows an exception of a slot: the window would stay open.
+        try:
+            save_png(self._path, self._window)
+        except EscapeError as error:
+            self.error = error
+        finally:
+            self._end()
+
+    def _end(self) -> None:
+        self._poll.stop()
+        self._window.close_without_question()

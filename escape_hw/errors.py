@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import traceback
+from pathlib import Path
+
 
 class EscapeError(Exception):
     """Base class of all exceptions raised by ESCAPE; ``exit_code`` is that of the command line.
@@ -107,3 +110,9 @@ class ClientUnknown(RequestRefused):
 
 class ServerFull(RequestRefused):
     """The server has no free place for a client; open_loop, flatten and abort work all the same."""
+
+
+def raised_at(error: BaseException) -> str:
+    """Where an exception of somebody else's code was raised: `` (acme.py, line 12)``; empty if unknown."""
+    frames = traceback.extract_tb(error.__traceback__)
+    return f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno})" if frames else ""

@@ -107,7 +107,7 @@ class ServerAttachment(QObject):
 
     #: A new connection, as :class:`LiveSource`.
     attached = Signal(object)
-    #: Why the connection failed; emitted when the reason changes.
+    #: Why an attempt to connect failed.
     connection_failed = Signal(str)
 
     def __init__(self, address: str) -> None:
@@ -117,7 +117,6 @@ class ServerAttachment(QObject):
         self._jobs: queue.Queue[Callable[[], None]] = queue.Queue()
         self._stop = threading.Event()
         self._live: LiveSource | None = None
-        self._last_failure = ""
         self._last_heard_s = 0.0
         self._thread = threading.Thread(target=self._run_loop, name="escape-gui-attachment", daemon=True)
 
@@ -148,7 +147,7 @@ class ServerAttachment(QObject):
             try:
                 self._check_connection()
             except EscapeError as error:
-                self._report_failure(str(error))
+                self.connection_failed.emit(str(error))
             except Exception:
                 log.exception("connection check failed")
             self._wait_and_run_jobs()
@@ -166,7 +165,7 @@ class ServerAttachment(QObject):
             return
         connection = connect(self.address, name=CLIENT_NAME)
         self._live = LiveSource(connection, is_local=self._is_local)
-        self._last_heard_s, self._last_failure = now, ""
+        self._last_heard_s = now
         self.attached.emit(self._live)
 
     def _same_server(self) -> bool:
@@ -175,11 +174,6 @@ class ServerAttachment(QObject):
             return True
         listing = find_server(self.address)
         return listing is not None and listing.pid == self._live.state.server_pid
-
-    def _report_failure(self, reason: str) -> None:
-        if reason != self._last_failure:
-            self._last_failure = reason
-            self.connection_failed.emit(reason)
 
     def _wait_and_run_jobs(self) -> None:
         """Wait for one period, or run a job that arrives meanwhile."""

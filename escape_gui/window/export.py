@@ -20,9 +20,6 @@ from escape_hw.io.provenance import Provenance
 from escape_hw.io.storage import write_atomic
 from escape_hw.remote.state import State
 
-#: Kind of the FITS files: content of a panel, not a calibration product.
-KIND_SCREEN = "SCREEN"
-
 
 def save_png(path: Path, widget: QWidget) -> tuple[Path, ...]:
     """Save an image of a widget and return the path; raise `StorageError` if it cannot be written."""
@@ -56,7 +53,7 @@ def save_fits(path: Path, panel: Panel, state: State) -> tuple[Path, ...]:
 
     arrays = _arrays(panel)
     origin = Provenance(seed=state.seed if state.simulated else None)
-    head = fits_file.primary_hdu(KIND_SCREEN, state.system, state.simulated, False, origin)
+    head = fits_file.primary_hdu(fits_file.KIND_SCREEN, state.system, state.simulated, False, origin)
     head.header["PANEL"] = (panel.name, "panel that showed it")
     images = [fits_file.image_extension(one.name.upper(), np.asarray(one.data), one.unit) for one in arrays]
     for hdu, one in zip(images, arrays, strict=True):

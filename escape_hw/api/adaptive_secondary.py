@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import abc
 import enum
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import final
 
@@ -108,13 +109,13 @@ class AdaptiveSecondary(DeformableMirror):
     def state(self) -> ShellState:
         """Present state."""
         self.require_open()
-        return self._state()
+        return self._present_state()
 
     @property
     def health(self) -> ShellHealth:
         """Present health record."""
         self.require_open()
-        return self._in_layout(self._health())
+        return self._present_health()
 
     @final
     def observe_health(self) -> ShellHealth:
@@ -125,13 +126,14 @@ class AdaptiveSecondary(DeformableMirror):
         DeviceError
             The mirror reports its health only to the client in control.
         """
-        return self._in_layout(self._health() if self.is_open else self._observe_health())
+        return self._present_health() if self.is_open else self._in_layout(self._observe_health)
 
     @final
     def measured_positions(self) -> NDArray[np.float64]:
         """Measured actuator positions ``(n_act,)``, fractions of full stroke; NaN where unreadable."""
         self.require_open()
-        positions = np.array(self._measure_positions(), dtype=np.float64)
+        with self._driver_calls:
+            positions = np.array(self._measure_positions(), dtype=np.float64)
         if positions.shape != (self.info.n_act,):
             raise DeviceError(
                 self.name, f"reported positions of shape {positions.shape} for {self.info.n_act} actuators"
@@ -158,11 +160,12 @@ class AdaptiveSecondary(DeformableMirror):
                     self.flatten()
                 up = STATE_ORDER.index(state) > STATE_ORDER.index(now)
                 next_state = STATE_ORDER[STATE_ORDER.index(now) + (1 if up else -1)]
-                self._step(next_state)
-                if self._state() is not next_state:
+                with self._driver_calls:
+                    self._step(next_state)
+                if (reached := self._present_state()) is not next_state:
                     raise DeviceError(
                         self.name,
-                        f"is {self._state()}, not {next_state}, after a step from {now}; see its health",
+                        f"is {reached}, not {next_state}, after a step from {now}; see its health",
                     )
                 if next_state is ShellState.SET:
                     # Lifting the shell makes it flat, regardless of the last command.
@@ -179,20 +182,30 @@ class AdaptiveSecondary(DeformableMirror):
         """
         with self._lock:
             self.require_open()
-            if self._state() is not ShellState.FAULT:
+            if self._present_state() is not ShellState.FAULT:
                 return
-            self._recover()
-            if self._state() is ShellState.FAULT:
-                raise DeviceError(self.name, f"the fault persists: {self._health().fault}")
+            with self._driver_calls:
+                self._recover()
+            if self._present_state() is ShellState.FAULT:
+                raise DeviceError(self.name, f"the fault persists: {self._present_health().fault}")
 
-    def _in_layout(self, health: ShellHealth) -> ShellHealth:
+    def _present_state(self) -> ShellState:
+        with self._driver_calls:
+            return self._require_kind(self._state(), ShellState, "its state")
+
+    def _present_health(self) -> ShellHealth:
+        return self._in_layout(self._health)
+
+    def _in_layout(self, read: Callable[[], ShellHealth]) -> ShellHealth:
         """A health record of the hardware with the numbering of the layout."""
-        return replace(health, contaminated=self._numbers_in_layout(health.contaminated))
+        with self._driver_calls:
+            health = self._require_kind(read(), ShellHealth, "its health record")
+            return replace(health, contaminated=self._numbers_in_layout(health.contaminated))
 
     def _healthy_state(self) -> ShellState:
-        state = self._state()
+        state = self._present_state()
         if state is ShellState.FAULT:
-            raise self._fault_error(self._health().fault)
+            raise self._fault_error(self._present_health().fault)
         return state
 
     def _fault_error(self, fault: str) -> DeviceError:
@@ -204,7 +217,7 @@ class AdaptiveSecondary(DeformableMirror):
         )
 
     def _accepts_commands(self) -> bool:
-        return self._state() is ShellState.RUNNING
+        return self._present_state() is ShellState.RUNNING
 
     def _after_open(self) -> None:
         super()._after_open()
@@ -219,7 +232,7 @@ class AdaptiveSecondary(DeformableMirror):
             # An unattended shell that cannot be flattened must not stay floating.
             self._clean_up(lambda: self._step_down(end), error)
             raise
-        if self._state() in (ShellState.SET, ShellState.RUNNING):
+        if self._present_state() in (ShellState.SET, ShellState.RUNNING):
             self.go_to(end)
 
     def _step_down(self, end: ShellState) -> None:

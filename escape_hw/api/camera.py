@@ -6,14 +6,15 @@ import abc
 import math
 from collections.abc import Callable
 from dataclasses import astuple, dataclass, replace
-from typing import final
+from numbers import Real
+from typing import cast, final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from escape_hw.api.device import Device
 from escape_hw.api.flips import Flip, exchanges_axes, flip_image
-from escape_hw.api.representation import short_repr
+from escape_hw.api.representation import describe_value, short_repr
 from escape_hw.deprecation import renamed_members
 from escape_hw.errors import DeviceError, FrameTimeout, SettingRejected
 
@@ -99,6 +100,36 @@ class FrameStatus:
     timeouts: int = 0
 
 
+#: Type of the counts of a frame.
+_COUNTS = np.dtype(np.uint16)
+#: Types of whole numbers.
+_WHOLE = (int, np.integer)
+
+
+def _find_fault(want: object, sensor_shape: tuple[int, int]) -> str | None:
+    """Why no camera with this sensor ``(rows, columns)`` has these settings, or ``None``."""
+    if not isinstance(want, CameraSettings) or not isinstance(want.region, Region):
+        return f"{describe_value(want)} are no CameraSettings with a Region"
+    rows, columns = sensor_shape
+    region = want.region
+    if not all(isinstance(v, _WHOLE) for v in astuple(region)):
+        return f"region {region} must be in whole pixels"
+    if (
+        min(region.x, region.y) < 0
+        or min(region.width, region.height) < 1
+        or region.x + region.width > columns
+        or region.y + region.height > rows
+    ):
+        return f"region {region} does not lie on the sensor of {columns} x {rows} pixels"
+    for name in ("exposure_s", "frame_rate_hz"):
+        value = getattr(want, name)
+        if not isinstance(value, Real) or not 0 < float(value) < math.inf:
+            return f"{name} is {value!r}; it must be positive and finite"
+    if not isinstance(want.gain_db, Real) or not math.isfinite(want.gain_db):
+        return f"gain_db is {want.gain_db!r}; it must be finite"
+    return None
+
+
 @renamed_members(tap="callback")
 class Camera(Device):
     """A camera. ``start`` and ``stop`` may be repeated; ``next_frame`` starts it when needed.
@@ -123,6 +154,7 @@ class Camera(Device):
         self._running = False
         self._delivered = self._lost = self._timeouts = 0
         self._last_index: int | None = None
+        self._frame_shape = (0, 0)
 
     @property
     @abc.abstractmethod
@@ -149,35 +181,39 @@ class Camera(Device):
             The settings are outside the range of the device; the message gives the range.
         """
         self.require_open()
-        self._require_valid(want)
-        return self._check(want)
+        with self._driver_calls:
+            self._require_valid(want)
+            answer = self._check(want)
+        return self._require_possible(answer)
 
     def _require_valid(self, want: CameraSettings) -> None:
         """Refuse settings that no camera with this sensor has, as :meth:`check`; ``info`` must be known."""
-        rows, columns = self.info.sensor_shape
+        if (fault := _find_fault(want, self.info.sensor_shape)) is not None:
+            raise SettingRejected(self.name, fault)
         region = want.region
-        if not all(isinstance(v, int | np.integer) for v in astuple(region)):
-            raise SettingRejected(self.name, f"region {region} must be in whole pixels")
-        if (
-            min(region.x, region.y) < 0
-            or min(region.width, region.height) < 1
-            or region.x + region.width > columns
-            or region.y + region.height > rows
-        ):
-            raise SettingRejected(
-                self.name, f"region {region} does not lie on the sensor of {columns} x {rows} pixels"
-            )
         if region.width != region.height and exchanges_axes(self.flip):
             raise SettingRejected(
                 self.name, f"region {region} must be square, since flip = '{self.flip}' exchanges its sides"
             )
-        for name in ("exposure_s", "frame_rate_hz"):
-            if not 0 < getattr(want, name) < math.inf:
-                raise SettingRejected(
-                    self.name, f"{name} is {getattr(want, name)}; it must be positive and finite"
-                )
-        if not math.isfinite(want.gain_db):
-            raise SettingRejected(self.name, f"gain_db is {want.gain_db}; it must be finite")
+
+    def _require_possible(self, answer: object) -> CameraSettings:
+        """Refuse settings of the driver that no camera with this sensor has."""
+        if (fault := _find_fault(answer, self.info.sensor_shape)) is not None:
+            raise self.driver_defect(f"its settings are impossible: {fault}")
+        return cast(CameraSettings, answer)
+
+    def _settings_in_force(self) -> CameraSettings:
+        with self._driver_calls:
+            return self._require_possible(self.settings)
+
+    def _after_open(self) -> None:
+        info = self._require_kind(self.info, CameraInfo, "info")
+        sensor = self._require_kind(info.sensor_shape, tuple, "info.sensor_shape")
+        if len(sensor) != 2 or not all(isinstance(n, _WHOLE) and n > 0 for n in sensor):
+            raise self.driver_defect(f"info.sensor_shape is {sensor}, not (rows, columns)")
+        if not isinstance(info.bit_depth, int) or not 1 <= info.bit_depth <= 16:
+            raise self.driver_defect(f"info.bit_depth is {info.bit_depth!r}; counts have 1 to 16 bits")
+        self._settings_in_force()
 
     @final
     def configure(self, want: CameraSettings) -> CameraSettings:
@@ -194,10 +230,11 @@ class Camera(Device):
             achievable = self.check(want)
             running = self._running
             self.stop()
-            self._configure(achievable)
+            with self._driver_calls:
+                self._configure(achievable)
             if running:
                 self.start()
-            return self.settings
+            return self._settings_in_force()
 
     @final
     def start(self) -> None:
@@ -206,15 +243,19 @@ class Camera(Device):
         if not self._running:
             self._delivered = self._lost = self._timeouts = 0
             self._last_index = None
-            self._start()
+            with self._driver_calls:
+                self._start()
             self._running = True
+            region = self._settings_in_force().region
+            self._frame_shape = (region.height, region.width)
 
     @final
     def stop(self) -> None:
         """Stop acquisition; does nothing when stopped."""
         if self._running:
             self._running = False
-            self._stop()
+            with self._driver_calls:
+                self._stop()
 
     @final
     def next_frame(self, timeout_s: float = 1.0) -> Frame:
@@ -234,7 +275,8 @@ class Camera(Device):
             raise SettingRejected(self.name, f"timeout_s is {timeout_s}; it must be positive and finite")
         self.start()
         try:
-            frame = self._next_frame(timeout_s)
+            with self._driver_calls:
+                frame = self._next_frame(timeout_s)
         except FrameTimeout:
             self._timeouts += 1
             raise
@@ -252,16 +294,14 @@ class Camera(Device):
         try:
             self.require_open()
             self.start()
-            frame = self._poll()
+            with self._driver_calls:
+                frame = self._poll()
             return None if frame is None else self._register_frame(frame)
         finally:
             self._lock.release()
 
     def _register_frame(self, frame: Frame) -> Frame:
-        if not isinstance(frame, Frame):
-            raise DeviceError(
-                self.name, f"delivered {type(frame).__name__} for a frame; this is a defect of its driver"
-            )
+        self._require_well_formed(frame)
         if self._last_index is not None:
             if frame.index <= self._last_index:
                 raise DeviceError(
@@ -279,6 +319,26 @@ class Camera(Device):
         if self.callback is not None:
             self.callback(frame)
         return frame
+
+    def _require_well_formed(self, frame: object) -> None:
+        """Refuse what a driver delivers that is no frame of the region in force."""
+        if not isinstance(frame, Frame):
+            raise self.driver_defect(f"delivered {describe_value(frame)} for a frame")
+        data, rows_and_columns = frame.data, self._frame_shape
+        if not isinstance(data, np.ndarray) or data.dtype != _COUNTS or data.shape != rows_and_columns:
+            raise self.driver_defect(
+                f"delivered a frame with data {describe_value(data)}, not uint16 {rows_and_columns}"
+            )
+        if not (
+            isinstance(frame.index, _WHOLE)
+            and isinstance(frame.exposed_ns, _WHOLE)
+            and isinstance(frame.arrived_ns, _WHOLE)
+            and isinstance(frame.n_saturated, _WHOLE)
+        ):
+            raise self.driver_defect(
+                f"delivered a frame with index {frame.index!r}, exposed_ns {frame.exposed_ns!r}, arrived_ns "
+                f"{frame.arrived_ns!r} and n_saturated {frame.n_saturated!r}; they must be whole numbers"
+            )
 
     @property
     def last_index(self) -> int:

@@ -8,11 +8,32 @@ import logging
 import threading
 import time
 from collections.abc import Callable
-from typing import Self, final
+from types import TracebackType
+from typing import Self, TypeVar, final
 
-from escape_hw.errors import NotOpen
+from escape_hw.api.representation import describe_value
+from escape_hw.errors import DeviceError, EscapeError, NotOpen, raised_at
 
 log = logging.getLogger(__name__)
+T = TypeVar("T")
+
+
+class _DriverCalls:
+    """Context in which hooks are called: any exception but ESCAPE's becomes a defect of the driver."""
+
+    def __init__(self, device: Device) -> None:
+        self._device = device
+
+    def __enter__(self) -> None:
+        """Nothing to prepare: one context serves all calls."""
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if isinstance(error, Exception) and not isinstance(error, EscapeError):
+            log.info("%s: exception of its driver", self._device.name, exc_info=error)
+            text = f"failed with {type(error).__name__}: {error}{raised_at(error)}"
+            raise self._device.driver_defect(text) from error
 
 
 class Device(abc.ABC):
@@ -44,6 +65,8 @@ class Device(abc.ABC):
         self._is_open = False
         #: Held while the connection changes, and during transfers that closing must not interrupt.
         self._lock = threading.RLock()
+        #: Entered around every call of a hook that the driver implements.
+        self._driver_calls = _DriverCalls(self)
 
     @property
     def is_open(self) -> bool:
@@ -57,20 +80,22 @@ class Device(abc.ABC):
         Raises
         ------
         DeviceError
-            The device cannot be reached; everything opened so far is closed.
+            The device cannot be reached, or its driver has a defect; everything opened so far is closed.
         """
         with self._lock:
             if self._is_open:
                 return self
             self._before_open()
             try:
-                self._open()
+                with self._driver_calls:
+                    self._open()
             except BaseException as cause:
                 self._clean_up(self._release_after_failed_open, cause)
                 raise
             self._is_open = True
             try:
-                self._after_open()
+                with self._driver_calls:
+                    self._after_open()
             except BaseException as cause:
                 self._is_open = False
                 self._clean_up(self._close, cause)
@@ -93,13 +118,15 @@ class Device(abc.ABC):
             if not self._is_open:
                 return
             try:
-                self._before_close()
+                with self._driver_calls:
+                    self._before_close()
             except BaseException as cause:
                 self._is_open = False
                 self._clean_up(self._close, cause)
                 raise
             self._is_open = False
-            self._close()
+            with self._driver_calls:
+                self._close()
 
     def __enter__(self) -> Self:
         return self.open()
@@ -114,6 +141,17 @@ class Device(abc.ABC):
         """Raise :class:`NotOpen` unless the device is open."""
         if not self._is_open:
             raise NotOpen(self.name, "not open; call open() first, or use it in a 'with' statement")
+
+    def driver_defect(self, what: str) -> DeviceError:
+        """The error of a driver that breaks its interface; ``what`` says how, as in "returned None"."""
+        driver = f"{type(self).__module__}.{type(self).__qualname__}"
+        return DeviceError(self.name, f"{what}; this is a defect of its driver, {driver}")
+
+    def _require_kind(self, value: object, kind: type[T], what: str) -> T:
+        """Refuse what a driver returns if it is of another type; ``what`` names it in the message."""
+        if not isinstance(value, kind):
+            raise self.driver_defect(f"{what} is {describe_value(value)}, not a {kind.__name__}")
+        return value
 
     @property
     def applies_twin_section(self) -> bool:

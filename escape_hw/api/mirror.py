@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from escape_hw.api.device import Device
-from escape_hw.api.representation import short_repr
+from escape_hw.api.representation import describe_value, short_repr
 from escape_hw.deprecation import renamed_members
 from escape_hw.errors import CommandRejected, DeviceError, SettingRejected
 from escape_hw.safety.guard import CommandGuard, GuardReport, load_compiled_check
@@ -165,7 +165,10 @@ class DeformableMirror(Device):
                 self.rejected_count += 1
                 raise
             try:
-                kept_shape = self._send(self._to_hardware(safe))
+                with self._driver_calls:
+                    kept_shape = self._send(self._to_hardware(safe))
+                if kept_shape is not None:
+                    self._require_shape(kept_shape, "the shape that it kept")
             except BaseException:
                 # The command may have reached the mirror although its acknowledgement did not arrive.
                 self._shape_known = False
@@ -253,11 +256,9 @@ class DeformableMirror(Device):
         return self._guard
 
     def _after_open(self) -> None:
-        info = self.info
-        if info.layout is not None and int(info.layout.sum()) != info.n_act:
-            raise DeviceError(
-                self.name, f"its layout has {int(info.layout.sum())} positions for {info.n_act} actuators"
-            )
+        info = self._require_kind(self.info, DMInfo, "info")
+        if (defect := _find_defect(info)) is not None:
+            raise self.driver_defect(defect)
         try:
             guard = CommandGuard(self.name, info.n_act, self.limits, _pairs_of(info))
         except ValueError as error:
@@ -281,7 +282,17 @@ class DeformableMirror(Device):
     def _present_in_layout(self) -> NDArray[np.float64] | None:
         """The shape that the hardware reports, in the numbering of the layout; ``None``: unknown."""
         present = self._present_shape()
-        return None if present is None else self._from_hardware(present)
+        if present is None:
+            return None
+        self._require_shape(present, "its present shape")
+        return self._from_hardware(present)
+
+    def _require_shape(self, shape: object, what: str) -> None:
+        """Refuse a shape of the hardware that is no finite ``(n_act,)``; ``what`` names it in the message."""
+        array = self._require_kind(shape, np.ndarray, what)
+        n_act = self.info.n_act
+        if array.dtype.kind not in "fiu" or array.shape != (n_act,) or not np.isfinite(array).all():
+            raise self.driver_defect(f"{what} is {describe_value(array)}, not {n_act} finite numbers")
 
     def _to_hardware(self, shape: NDArray[np.float64]) -> NDArray[np.float64]:
         """A shape ``(n_act,)`` with the numbering and the sign of the hardware, read-only."""
@@ -336,6 +347,22 @@ class DeformableMirror(Device):
             ``None``: the command was accepted. A mirror that skipped it returns the shape that it kept,
             read-only.
         """
+
+
+def _find_defect(info: DMInfo) -> str | None:
+    """What is wrong with the geometry that a driver reports, or ``None``."""
+    if not isinstance(info.n_act, int | np.integer) or info.n_act < 1:
+        return f"info.n_act is {describe_value(info.n_act)}; a mirror has at least one actuator"
+    positions, layout = info.positions_m, info.layout
+    if not isinstance(positions, np.ndarray) or positions.shape != (info.n_act, 2):
+        return f"info.positions_m is {describe_value(positions)}, not an array ({info.n_act}, 2)"
+    if layout is None:
+        return None
+    if not isinstance(layout, np.ndarray) or layout.dtype != np.bool_ or layout.ndim != 2:
+        return f"info.layout is {describe_value(layout)}, neither a map of true and false nor None"
+    if layout.sum() != info.n_act:
+        return f"its layout has {layout.sum()} positions for {info.n_act} actuators"
+    return None
 
 
 def _pairs_of(info: DMInfo) -> NDArray[np.intp]:

@@ -91,7 +91,8 @@ class TipTiltModulator(Device):
                 self.name,
                 f"{want}: tilts by {largest_tilt:.4g} rad; the range is 0 to {self.info.max_tilt_rad:g} rad",
             )
-        return self._check(want)
+        with self._driver_calls:
+            return self._require_kind(self._check(want), Modulation, "its achievable modulation")
 
     @final
     def modulate(self, want: Modulation) -> Modulation:
@@ -105,23 +106,26 @@ class TipTiltModulator(Device):
             The stage did not start.
         """
         achievable = self.check(want)
-        self._modulate(achievable)
-        achieved = self.modulation
+        with self._driver_calls:
+            self._modulate(achievable)
+            achieved = self.modulation
         if achieved is None:
             raise DeviceError(self.name, f"does not move after the start of {achievable}")
-        return achieved
+        return self._require_kind(achieved, Modulation, "its modulation")
 
     @final
     def park(self) -> None:
         """Stop modulating and go to the centre; may be repeated."""
         self.require_open()
-        self._park()
+        with self._driver_calls:
+            self._park()
 
     @final
     def status(self) -> ModulatorStatus:
         """Present status. Moves nothing; a closed stage is connected for the query."""
-        with self._lock:
-            return self._status() if self.is_open else self._status_when_closed()
+        with self._lock, self._driver_calls:
+            status = self._status() if self.is_open else self._status_when_closed()
+            return self._require_kind(status, ModulatorStatus, "its status")
 
     @final
     def release(self) -> bool:
@@ -131,11 +135,16 @@ class TipTiltModulator(Device):
         """
         with self._lock:
             self.require_open()
-            if not self._release():
+            with self._driver_calls:
+                released = self._release()
+            if not released:
                 self.close()
                 return False
             self._is_open = False
             return True
+
+    def _after_open(self) -> None:
+        self._require_kind(self.info, ModulatorInfo, "info")
 
     def _before_close(self) -> None:
         self._park()

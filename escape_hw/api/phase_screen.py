@@ -74,7 +74,8 @@ class PhaseScreen(Device):
             A value is out of range; nothing is changed.
         """
         self.require_open()
-        now = self.state
+        with self._driver_calls:
+            now, n_screens = self._require_kind(self.state, ScreenState, "its state"), self.n_screens
         want = ScreenState(
             now.screen if screen is None else screen,
             now.inserted if inserted is None else inserted,
@@ -86,14 +87,19 @@ class PhaseScreen(Device):
         for name, value in (("inserted", want.inserted), ("blocked", want.blocked)):
             if not isinstance(value, bool | np.bool_):
                 raise SettingRejected(self.name, f"{name} is {value!r}; it must be true or false")
-        if not 0 <= want.screen < self.n_screens:
-            raise SettingRejected(self.name, f"screen {want.screen} is not one of 0..{self.n_screens - 1}")
+        if not 0 <= want.screen < n_screens:
+            raise SettingRejected(self.name, f"screen {want.screen} is not one of 0..{n_screens - 1}")
         if not 0 <= want.speed_m_s < math.inf:
             raise SettingRejected(
                 self.name, f"speed_m_s is {want.speed_m_s}; it must be finite and not negative"
             )
-        self._set(want)
-        return self.state
+        with self._driver_calls:
+            self._set(want)
+            return self._require_kind(self.state, ScreenState, "its state")
+
+    def _after_open(self) -> None:
+        self._require_kind(self.info, ScreenInfo, "info")
+        self._require_kind(self.n_screens, int, "n_screens")
 
     @abc.abstractmethod
     def _set(self, want: ScreenState) -> None:

@@ -13,6 +13,7 @@ from rich.text import Text
 
 from escape_hw.api.influence import InfluenceProfile
 from escape_hw.api.results import CalibrationResult, RegistrationEstimate
+from escape_hw.errors import ProductError
 from escape_hw.report.tables import Table, criterion_symbol
 from escape_hw.report.verdict import Quality, assess
 
@@ -63,6 +64,17 @@ def format_calibration(result: CalibrationResult) -> list[str]:
     return [*lines, *result.notes]
 
 
+#: Runs whose result is a few numbers, by command, with these numbers.
+_VALUES = {
+    "sensor": "sensor: {n_sub_apertures} sub-apertures, {counts:.4g} counts per frame in a bright one, "
+    "background {background:.4g} counts",
+    "model-psf": "PSF of the flat mirror without turbulence: peak {peak:.4g} counts, total {total:.4g} "
+    "counts",
+    "dark": "dark frame: mean {mean:.4g} counts, scatter {scatter:.4g} counts rms over the pixels",
+    "flat": "relative response of the pixels: mean {mean:.4g}, scatter {scatter:.4g} rms over the pixels",
+}
+
+
 def format_criteria(checks: Iterable[Mapping[str, Any]]) -> list[Text]:
     """Criteria with a tick, a cross, or an exclamation mark where met with a limitation."""
     return [
@@ -82,6 +94,17 @@ def format_verdict(document: Mapping[str, Any]) -> list[Text]:
     """The line of verdict on a result; none on a result without a criterion."""
     verdict = assess(document)
     return [] if verdict is None else [Text(str(verdict), style=_QUALITY_STYLES[verdict.quality])]
+
+
+def format_values(document: Mapping[str, Any]) -> list[str]:
+    """The numbers of a run whose result is a few of them (ProductError: one is missing or no number)."""
+    command = document["command"]
+    try:
+        return [_VALUES[command].format_map(document)] if command in _VALUES else []
+    except (KeyError, TypeError, ValueError) as error:
+        raise ProductError(
+            f"the result of '{command}' is damaged: {type(error).__name__}: {error}"
+        ) from error
 
 
 def format_products(products: Mapping[str, Any]) -> list[str]:

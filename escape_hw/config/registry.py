@@ -6,7 +6,6 @@ import contextlib
 import importlib.metadata
 import inspect
 import sys
-import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache, partial
@@ -19,7 +18,7 @@ from escape_hw.api.sensor import SensorGeometry
 from escape_hw.api.synthetic_model import SyntheticModel
 from escape_hw.config.system import SystemConfig
 from escape_hw.deprecation import warn_renamed
-from escape_hw.errors import ConfigError, EscapeError
+from escape_hw.errors import ConfigError, EscapeError, raised_at
 from escape_hw.suggestions import closest_match
 
 T = TypeVar("T")
@@ -71,7 +70,7 @@ def call_factory(what: str, kind: type[T], factory: Callable[..., object], *argu
     except Exception as error:
         raise ConfigError(
             f"{what} cannot be created: {_factory_name(factory)} failed with {type(error).__name__}: {error}"
-            f"{_raised_at(error)}"
+            f"{raised_at(error)}"
         ) from error
     if not isinstance(product, kind):
         wrong = f"{what} creates a {type(product).__name__}, not a {kind.__name__}"
@@ -95,11 +94,6 @@ def _factory_name(factory: object) -> str:
     factory = factory.func if isinstance(factory, partial) else factory
     module, name = (getattr(factory, key, "") for key in ("__module__", "__qualname__"))
     return f"{module}:{name}" if module and name else repr(factory)
-
-
-def _raised_at(error: Exception) -> str:
-    frames = traceback.extract_tb(error.__traceback__)
-    return f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno})" if frames else ""
 
 
 DEVICES = "escape.devices"

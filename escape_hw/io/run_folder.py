@@ -13,7 +13,7 @@ from typing import Any, Self
 
 import platformdirs
 
-from escape_hw.errors import EscapeError, ProductError
+from escape_hw.errors import EscapeError, ProductError, StorageError
 from escape_hw.io.documents import dumps
 from escape_hw.io.provenance import get_git_state, get_software_version
 from escape_hw.io.storage import check_writable, make_folder, storage_error, write_atomic
@@ -93,7 +93,8 @@ class RunFolder:
     Raises
     ------
     StorageError
-        The folder cannot be created or written. Raised before anything moves.
+        The folder has no name of its own (``.``, ``/``), is a file, or cannot be created or written. Raised
+        before anything moves.
     """
 
     def __init__(self, system: str, kind: str, out: Path | str | None = None) -> None:
@@ -101,7 +102,14 @@ class RunFolder:
         if out is None:
             requested = dated_folder(default_runs_folder(), system, kind)
         else:
-            requested = Path(out).expanduser().absolute()
+            requested = Path(out).expanduser()
+            if requested.name in ("", ".."):
+                # An empty text is the current folder, too.
+                raise StorageError(
+                    f"'{out}' (--out) gives the folder of the run no name; name a new one, such as "
+                    f"{requested / kind}"
+                )
+            requested = requested.absolute()
         self.path = _create_unique_folder(requested)
         self.requested_path = requested if out is not None and self.path != requested else None
         self.products: dict[str, Path] = {}
@@ -221,6 +229,8 @@ def _sanitise_name(text: str) -> str:
 def _create_unique_folder(requested: Path) -> Path:
     """Make the folder, or the first free sibling when it already holds a run (safe between processes)."""
     make_folder(requested.parent)
+    if requested.exists() and not requested.is_dir():
+        raise StorageError(f"{requested}: is a file, not a folder; choose another name (--out)")
     for number in range(1, 10_000):
         path = requested if number == 1 else requested.with_name(f"{requested.name}-{number}")
         try:

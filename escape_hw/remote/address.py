@@ -67,9 +67,13 @@ def runtime_folder() -> Path:
     Raises
     ------
     StorageError
-        It cannot be created, or other users can write to it.
+        It cannot be created, belongs to another user, or other users can write to it.
     """
-    folder = Path(platformdirs.user_runtime_dir("escape", appauthor=False))
+    try:
+        folder = Path(platformdirs.user_runtime_dir("escape", appauthor=False))
+    except OSError as error:
+        # Its text names the folder, and XDG_RUNTIME_DIR as the remedy.
+        raise StorageError(str(error)) from error
     try:
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)
         status = folder.stat()

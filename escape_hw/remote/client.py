@@ -574,7 +574,7 @@ def connect(address: str, *, control: bool = False, take_over: bool = False, nam
     try:
         connection = Connection(endpoint, name, keys)
     except ServerGone as error:
-        raise ServerGone(f"{error}{keys_hint(endpoint.requests, keys)}") from None
+        raise ServerGone(f"{address}: {error}{keys_hint(endpoint.requests, keys)}") from None
     try:
         if control or take_over:
             connection.acquire(take_over)

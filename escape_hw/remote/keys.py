@@ -159,9 +159,9 @@ def keys_hint(address: str, keys: tuple[bytes, bytes, bytes] | None) -> str:
         return ""
     host = address.removeprefix("tcp://").rpartition(":")[0]
     if keys is None:
-        return f" If it requires keys: escape keys trust {host} KEY"
+        return f". If it requires keys: escape keys trust {host} KEY"
     return (
-        f" Check that it allows this key (there: escape keys allow NAME '{keys[1].decode()}'), and that its "
+        f". Check that it allows this key (there: escape keys allow NAME '{keys[1].decode()}'), and that its "
         "own key is the one that is trusted here (escape keys list)."
     )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
@@ -24,6 +25,9 @@ from escape_hw.io.fits.matrix import KIND_MATRIX, load_matrix
 from escape_hw.io.fits.telemetry import KIND_TELEMETRY
 from escape_hw.io.run_folder import RESULT_FILE, read_result
 from escape_hw.report.tables import METHOD_LABELS
+
+#: Kinds of products whose results a report and a replay show.
+_KINDS_WITH_RESULTS = (KIND_MATRIX, KIND_PSF, KIND_GAINS)
 
 
 class _Criterion(BaseModel):
@@ -156,11 +160,16 @@ def read_product(path: Path | str) -> RunContent:
     Raises
     ------
     ProductError
-        It is missing, damaged or of an unknown kind.
+        It is missing, damaged or of a kind without results.
     """
     file = Path(path).absolute()
     hdus, _ = fits_file.read(file)
     header = fits_file.header_dict(hdus)
+    if header["KIND"] not in (*_KINDS_WITH_RESULTS, KIND_TELEMETRY):
+        raise ProductError(
+            f"{file}: its kind is {header['KIND']!r}, which has neither report nor replay; "
+            f"'escape show {shlex.quote(str(path))}' summarises it"
+        )
     document: dict[str, Any] = {
         **documents.header_fields(
             "show", str(header["SYSTEM"]), bool(header["SIMULATE"]), header.get("SEED")
@@ -180,6 +189,7 @@ def read_product(path: Path | str) -> RunContent:
 
 
 def _add_product(run: RunContent, name: str, path: Path, label: Mapping[str, str]) -> None:
+    """Add a product; of those of other kinds than :data:`_KINDS_WITH_RESULTS`, only digest and kind."""
     hdus, digest = fits_file.read(path)
     kind = hdus[0].header["KIND"]
     run.digests[name], run.kinds[name] = digest, str(kind)
@@ -196,8 +206,6 @@ def _add_product(run: RunContent, name: str, path: Path, label: Mapping[str, str
     elif kind == KIND_GAINS:
         found = load_gains(path).result
         run.gains[_label(run.gains, label, found.method, name)] = found
-    elif kind != KIND_TELEMETRY:
-        raise ProductError(f"{path}: its kind is {kind!r}; this version reads IM, PSF, OG and TELEM")
 
 
 def _label(used: Mapping[str, object], stated: Mapping[str, str], method: str, name: str) -> str:

@@ -211,6 +211,26 @@ def check_camera_check_changes_nothing(camera: Camera) -> None:
 
 
 @check(Camera, READS)
+def check_camera_regions_do_not_grow(camera: Camera) -> None:
+    """The nearest region lies within the requested one; a region that contains none is rejected."""
+    now = camera.settings
+    for inset in (1, 2, 3, 5, min(now.region.width, now.region.height) - 1):
+        sides = now.region.width - inset, now.region.height - inset
+        if min(sides) < 1:
+            continue
+        want = Region(now.region.x + inset, now.region.y + inset, *sides)
+        try:
+            got = camera.check(replace(now, region=want)).region
+        except SettingRejected:
+            # It contains none of the regions of this camera.
+            continue
+        inside_x = want.x <= got.x and got.x + got.width <= want.x + want.width
+        inside_y = want.y <= got.y and got.y + got.height <= want.y + want.height
+        assert inside_x, f"check() made {got} of {want}, which does not contain its columns"
+        assert inside_y, f"check() made {got} of {want}, which does not contain its rows"
+
+
+@check(Camera, READS)
 def check_camera_refuses_regions_off_the_sensor(camera: Camera) -> None:
     """``check`` and ``configure`` reject a region outside the sensor."""
     before = camera.settings

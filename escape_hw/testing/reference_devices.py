@@ -122,11 +122,10 @@ class SyntheticCamera(_NothingToConnect, Camera):
         period_us = round(1e6 / want.frame_rate_hz)
         exposure_us = min(max(1, round(want.exposure_s * 1e6)), period_us)
         region, step = want.region, self._STEP_PX
-        width, height = (max(step, side // step * step) for side in (region.width, region.height))
+        width, height = (side // step * step for side in (region.width, region.height))
+        if min(width, height) < step:
+            raise SettingRejected(self.name, f"{region} contains no {step} x {step} pixels; enlarge it")
         whole = Region(region.x, region.y, width, height)
-        rows, columns = self.info.sensor_shape
-        if whole.x + whole.width > columns or whole.y + whole.height > rows:
-            raise SettingRejected(self.name, f"{region} leaves no {step} x {step} pixels on the sensor")
         return CameraSettings(whole, exposure_us * 1e-6, 1e6 / period_us, round(want.gain_db, 1))
 
     def _configure(self, settings: CameraSettings) -> None:

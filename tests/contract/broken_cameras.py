@@ -42,6 +42,17 @@ def drifts(self: Any, want: Any) -> Any:
     return replace(SyntheticCamera._check(self, want), gain_db=want.gain_db + 0.1)
 
 
+def grows(self: Any, want: Any) -> Any:
+    region = want.region
+    width, height = (-(-side // self._STEP_PX) * self._STEP_PX for side in (region.width, region.height))
+    return SyntheticCamera._check(self, replace(want, region=replace(region, width=width, height=height)))
+
+
+def moves_outwards(self: Any, want: Any) -> Any:
+    region = want.region
+    return SyntheticCamera._check(self, replace(want, region=replace(region, x=region.x // 4 * 4)))
+
+
 def never_right(self: Any, want: Any) -> Any:
     answer = SyntheticCamera._check(self, want)
     return replace(answer, exposure_s=1e-4 if answer.exposure_s == 1e-3 else 1e-3)
@@ -140,6 +151,8 @@ BROKEN: list[Broken] = [
     ("settings out of reach", SyntheticCamera, "camera_settings_are_achievable", {"_check": never_right}),
     ("check drifts", SyntheticCamera, "camera_check_is_a_fixed_point", {"_check": drifts}),
     ("check sets", SyntheticCamera, "camera_check_changes_nothing", {"_check": checks_by_setting}),
+    ("region grows", SyntheticCamera, "camera_regions_do_not_grow", {"_check": grows}),
+    ("region moves", SyntheticCamera, "camera_regions_do_not_grow", {"_check": moves_outwards}),
     ("any region", SyntheticCamera, "camera_refuses_regions_off_the_sensor", {"check": takes_all}),
     ("any settings", SyntheticCamera, "camera_refuses_meaningless_settings", {"check": takes_all}),
     ("configure lies", SyntheticCamera, "camera_configure_reports_actual_settings", {"configure": lies}),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -268,6 +269,21 @@ def test_a_failed_camera_and_a_lost_mirror_exit_3(run, system, im, tmp_path, mon
     assert "dm: lost" in err
     # It could not be flattened any more: that is said.
     assert "closing dm" in err
+
+
+@pytest.mark.parametrize(
+    ("command", "words"),
+    [
+        ("sensor", r"sensor: \d+ sub-apertures, .* counts per frame in a bright one, background .* counts"),
+        ("model-psf", r"PSF of the flat mirror without turbulence: peak .* counts, total .* counts"),
+        ("dark", r"dark frame: mean .* counts, scatter .* counts rms over the pixels"),
+    ],
+)
+def test_a_result_of_a_few_numbers_is_printed(escape, system, tmp_path, command, words):
+    code, text, _ = escape(command, system, "--frames", 5, "--out", tmp_path / "run")
+    assert code == 0
+    file = "dark: .*/dark.fits" if command == "dark" else "result: .*/run/result.json"
+    assert re.search(f"^SIMULATED *\n{words}\n{file}\n$", text)
 
 
 def test_no_light_and_no_response_exit_1(run, system, tmp_path):

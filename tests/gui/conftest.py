@@ -13,6 +13,7 @@ import pytest
 os.environ.setdefault("QT_QPA_PLATFORM", "offscreen")
 
 import shiboken6
+from command_line import escape  # noqa: F401 (a fixture)
 from gui_windows import dispose, settle, show_window
 from PySide6.QtCore import Qt, QTimer
 from PySide6.QtWidgets import QApplication

@@ -217,7 +217,7 @@ def test_without_a_server_none_is_found(served: Served, monkeypatch: pytest.Monk
         connect("elsewhere")
     with pytest.raises(ConfigError, match="is no address"):
         connect("http://127.0.0.1:80")
-    with pytest.raises(ServerGone, match="no reply to 'hello'"):
+    with pytest.raises(ServerGone, match=r"tcp://127\.0\.0\.1:9: no reply to 'hello'"):
         connect("tcp://127.0.0.1:9")
 
 

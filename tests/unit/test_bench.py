@@ -90,7 +90,8 @@ class FakeCamera(Camera):
         self.diary.note(f"stop {self.name}")
 
     def _next_frame(self, timeout_s: float) -> Frame:
-        return Frame(np.zeros((4, 4), np.uint16), 0, 0, 0)
+        region = self._settings.region
+        return Frame(np.zeros((region.height, region.width), np.uint16), 0, 0, 0)
 
 
 class FakeScreen(PhaseScreen):

@@ -67,15 +67,6 @@ def test_an_index_that_does_not_rise_is_an_error_and_not_counted(second: int) ->
         assert camera.status() == FrameStatus(delivered=2)
 
 
-def test_a_driver_that_delivers_no_frame_is_found_out() -> None:
-    with Scripted(None, np.zeros((2, 2))) as camera:
-        with pytest.raises(DeviceError, match="delivered NoneType for a frame"):
-            camera.next_frame()
-        with pytest.raises(DeviceError, match="delivered ndarray for a frame"):
-            camera.next_frame()
-        assert camera.status().delivered == 0
-
-
 def test_a_lost_camera_is_reported_and_closes() -> None:
     camera = Scripted(1, DeviceLost("wfs", "cable out"))
     with camera:

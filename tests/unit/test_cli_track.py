@@ -25,7 +25,10 @@ INJECTED = {
 
 def shown(result: TrackResult, injected: dict[str, float] | None, note: str = "") -> str:
     console = Console(file=io.StringIO(), width=120)
-    document = {**track_document(result), "injected_end": injected, "injected_note": note, "products": {}}
+    document = {
+        **track_document(result), "injected_end": injected, "injected_note": note,
+        "command": "track", "folder": "run", "products": {},
+    }  # fmt: skip
     for item in format_result("track", result, injected is not None, document):
         console.print(item)
     return console.file.getvalue()  # type: ignore[attr-defined, no-any-return]

@@ -126,3 +126,14 @@ def test_a_runtime_folder_that_others_may_write_to_is_not_used(home: Path) -> No
     (home / "escape").chmod(0o777)
     with pytest.raises(StorageError, match="other users can write there"):
         find_server("razor-shwfs")
+
+
+def test_a_runtime_folder_of_another_user_is_refused(escape, monkeypatch: pytest.MonkeyPatch) -> None:
+    reason = "runtime directory /tmp/runtime-0 is owned by uid 1001, not 0; set XDG_RUNTIME_DIR instead"
+
+    def refuse(*_: object, **__: object) -> str:
+        raise PermissionError(reason)
+
+    monkeypatch.setattr("escape_hw.remote.address.platformdirs.user_runtime_dir", refuse)
+    code, _, err = escape("serve", "razor-shwfs", "--mode", "sim")
+    assert (code, err.strip()) == (2, f"error: {reason}")

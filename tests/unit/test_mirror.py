@@ -258,7 +258,7 @@ def test_a_driver_cannot_write_into_the_shape() -> None:
                 command *= 2.0
 
     with Scribbler() as dm:
-        with pytest.raises(ValueError, match="read-only"):
+        with pytest.raises(DeviceError, match="read-only"):
             dm.send(np.full(N, 0.6))
         assert not dm.shape.any()
 

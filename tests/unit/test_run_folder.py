@@ -48,6 +48,16 @@ def test_empty_folder_given_by_the_user_is_used(home):
     assert RunFolder("s", "k", home / "mine").path == home / "mine"
 
 
+@pytest.mark.parametrize("out", ["", ".", "..", "/", "runs/.."])
+def test_a_folder_without_a_name_is_refused(home, monkeypatch, out):
+    monkeypatch.chdir(home)
+    with pytest.raises(
+        StorageError, match=r"'[./runs]*' \(--out\) gives .* no name; name a new one, such as .*k$"
+    ):
+        RunFolder("s", "k", Path(out))
+    assert not list(home.iterdir())
+
+
 def test_many_at_once_never_share_a_folder(home, monkeypatch):
     paths: list[Path] = []
 
@@ -90,16 +100,16 @@ def test_defect_leaves_its_traceback_in_the_log(home):
     assert "Traceback" in (home / "run" / "run.log").read_text()
 
 
-@pytest.mark.parametrize("out", ["file/run", "file"])
-def test_impossible_place_is_refused(home, out):
+@pytest.mark.parametrize(
+    ("out", "words"),
+    [("file/run", "cannot be written"), ("file", "is a file"), ("/dev/null", "is a file")],
+)
+def test_impossible_place_is_refused(home, out, words):
     (home / "file").write_text("kept")
-    if out == "file":
-        # A file of that name is left alone, and the run gets a sibling.
-        assert RunFolder("s", "k", home / out).path == home / "file-2"
-    else:
-        with pytest.raises(StorageError, match="choose another folder"):
-            RunFolder("s", "k", home / out)
+    with pytest.raises(StorageError, match=rf"(file|null): {words}.*choose another"):
+        RunFolder("s", "k", home / out)
     assert (home / "file").read_text() == "kept"
+    assert [one.name for one in home.iterdir()] == ["file"]
 
 
 def test_read_only_place_is_refused_before_the_run(home, monkeypatch):

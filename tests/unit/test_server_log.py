@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from escape_hw.errors import StorageError
 from escape_hw.remote.state import LogLine
 from escape_hw.server.ipc.log import ServerLog
 
@@ -52,3 +53,13 @@ def test_lines_of_other_threads_are_published_by_the_first(
     assert published == []
     server_log.flush()
     assert [line.number - 10**9 for line in published] == list(range(200))
+
+
+@pytest.mark.parametrize("blocked", ["server", "server/small.log"], ids=["folder", "file"])
+def test_a_log_that_cannot_be_written_is_refused(tmp_path: Path, blocked: str) -> None:
+    if blocked == "server":
+        (tmp_path / blocked).touch()
+    else:
+        (tmp_path / blocked).mkdir(parents=True)
+    with pytest.raises(StorageError, match=r"small\.log: the log of the server .* set XDG_DATA_HOME"):
+        ServerLog(tmp_path / "server" / "small.log", [].append)

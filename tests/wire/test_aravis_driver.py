@@ -157,9 +157,9 @@ def test_the_camera_of_revolt(arv, caplog) -> None:
         "library": arv.path, "pixel_format": "Mono10", "frame_rate_hz": 500.0, "region": (627, 377, 351, 351)
     }  # fmt: skip
     with AravisCamera("SIMCBLUE", exposure_s=1.99e-3, **settings) as camera:
-        assert camera.settings.region == Region(626, 376, 350, 350)
+        assert camera.settings.region == Region(628, 378, 350, 350)
         assert camera.info.full_scale == 1023
-    assert "reads [626, 376, 350, 350]" in caplog.text
+    assert "reads [628, 378, 350, 350]" in caplog.text
     with pytest.raises(SettingRejected, match=r"an exposure of 0\.002 s allow at most 498\.8"):
         AravisCamera("SIMCBLUE", exposure_s=2e-3, **settings).open()
     with pytest.raises(ConfigError, match=r"aravis\.pixel_format: 'Mono10p'  must be 'Mono16', "):
@@ -190,7 +190,7 @@ def test_settings_go_to_the_increments_and_are_read_back(arv) -> None:
     arv.script("set increment 4")
     with make("aravis") as camera:
         made = camera.configure(replace(camera.settings, region=Region(3, 5, 101, 33), frame_rate_hz=20))
-        assert made.region == Region(0, 4, 100, 32)
+        assert made.region == Region(4, 8, 100, 28)
         before = camera.settings
         with pytest.raises(SettingRejected, match=r"540 rows and an exposure of 0.001 s allow at most 178"):
             camera.configure(
@@ -202,10 +202,10 @@ def test_settings_go_to_the_increments_and_are_read_back(arv) -> None:
 
 def test_a_region_off_the_increments_is_reported(arv, caplog) -> None:
     with make("aravis", "devices.science.region=[297,207,127,127]") as camera:
-        assert camera.settings.region == Region(296, 206, 126, 126)
+        assert camera.settings.region == Region(298, 208, 126, 126)
     assert (
         "science: the region [297, 207, 127, 127] is not in the camera's steps (size 2 x 2, offsets 2 and 2"
-        "); it reads [296, 206, 126, 126]"
+        "); it reads [298, 208, 126, 126]"
     ) in caplog.text
     caplog.clear()
     with make("aravis"):

@@ -186,10 +186,12 @@ def test_saturated_pixels_are_counted(xi, format_) -> None:
 def test_regions_go_to_the_sensors_increments(xi) -> None:
     xi.script("set width_inc 16; set height_inc 4")
     with make("ximea", "devices.wfs.region=[121,57,401,399]") as camera:
-        assert camera.settings.region == Region(112, 56, 400, 398)
+        assert camera.settings.region == Region(128, 60, 384, 394)
         shifted = camera.configure(replace(camera.settings, region=Region(600, 500, 40, 12)))
-        assert shifted.region == Region(592, 500, 32, 10)
+        assert shifted.region == Region(608, 500, 32, 10)
         assert camera.next_frame(1.0).data.shape == (10, 32)
+        with pytest.raises(SettingRejected, match=r"contains no region of this camera.* x in steps of 16"):
+            camera.check(replace(camera.settings, region=Region(601, 500, 20, 12)))
     assert not xi.violations
 
 
@@ -212,6 +214,10 @@ def test_check_is_a_fixed_point_and_configure_keeps_to_it(
         try:
             answer = camera.check(want)
             assert camera.check(answer) == answer
+            assert answer.region.x >= x
+            assert answer.region.y >= y
+            assert answer.region.x + answer.region.width <= x + region.width
+            assert answer.region.y + answer.region.height <= y + region.height
             made = camera.configure(want)
         except SettingRejected:
             assert camera.settings == before

@@ -58,7 +58,7 @@ class CameraLimits:
         Raises
         ------
         SettingRejected
-            The gain is outside its limits.
+            The gain is outside its limits, or the region contains none of this camera.
         """
         low, high = self.gain.low, self.gain.high
         if not low - TOLERANCE <= want.gain_db <= high + TOLERANCE:
@@ -67,11 +67,23 @@ class CameraLimits:
         if exposure_us > max_exposure_s * 1e6:
             exposure_us = self.exposure.round_down(max_exposure_s * 1e6)
         gain_db = self.gain.nearest_valid(want.gain_db)
-        return CameraSettings(self._region(want.region), exposure_us * 1e-6, want.frame_rate_hz, gain_db)
+        region = self._region(device, want.region)
+        return CameraSettings(region, exposure_us * 1e-6, want.frame_rate_hz, gain_db)
 
-    def _region(self, want: Region) -> Region:
-        """The largest region on the sensor's increments within the requested one, where possible."""
-        width, height = round(self.width.round_down(want.width)), round(self.height.round_down(want.height))
-        x = min(want.x, round(self.width.high) - width)
-        y = min(want.y, round(self.height.high) - height)
-        return Region(x - x % max(1, self.x_step), y - y % max(1, self.y_step), width, height)
+    def _region(self, device: str, want: Region) -> Region:
+        """The largest region on the sensor's increments within the requested one."""
+        left, top = _next_multiple(want.x, self.x_step), _next_multiple(want.y, self.y_step)
+        width, height = want.x + want.width - left, want.y + want.height - top
+        if width < self.width.low or height < self.height.low:
+            raise SettingRejected(
+                device,
+                f"{want} contains no region of this camera, which has at least {self.width.low:g} x "
+                f"{self.height.low:g} pixels, x in steps of {max(1, self.x_step)} and y of "
+                f"{max(1, self.y_step)}; enlarge it",
+            )
+        return Region(left, top, round(self.width.round_down(width)), round(self.height.round_down(height)))
+
+
+def _next_multiple(value: int, step: int) -> int:
+    """The smallest multiple of ``step`` (0: none) that is not below ``value``."""
+    return value + -value % max(1, step)

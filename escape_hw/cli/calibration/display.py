@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from escape_hw.runtime.procedures.calibration import METHODS
@@ -20,16 +21,25 @@ def format_result(
 ) -> Iterator[RenderableType]:
     """Format the result of a procedure: its origin, its values, criteria, verdict and products.
 
-    A procedure without a table of its own has criteria and products only.
+    A procedure without a table or numbers of its own has criteria and products only.
     """
-    from escape_hw.cli.formatting import format_criteria, format_products, format_verdict, status_line
+    from escape_hw.cli.formatting import (
+        format_criteria,
+        format_products,
+        format_values,
+        format_verdict,
+        status_line,
+    )
+    from escape_hw.io.run_folder import RESULT_FILE
 
     yield status_line(simulated, bool(document.get("partial")))
     if procedure in _VALUES:
         yield from _VALUES[procedure](result, document)
+    yield from format_values(document)
     yield from format_criteria(document.get("criteria", ()))
     yield from format_verdict(document)
-    yield from format_products(document["products"])
+    # Without a product, the numbers are in the document only.
+    yield from format_products(document["products"] or {"result": Path(document["folder"]) / RESULT_FILE})
 
 
 def _calibration(result: CalibrationResult, document: dict[str, Any]) -> Iterator[RenderableType]:

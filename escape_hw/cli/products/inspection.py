@@ -10,7 +10,7 @@ import typer
 
 from escape_hw.cli.command import command
 from escape_hw.cli.context import CommandContext
-from escape_hw.errors import CalibrationError
+from escape_hw.errors import CalibrationError, ProductError
 
 if TYPE_CHECKING:
     from escape_hw.api.interaction_matrix import InteractionMatrix
@@ -50,6 +50,7 @@ def _show_run(context: CommandContext, folder: Path) -> None:
     from escape_hw.cli.formatting import (
         format_criteria,
         format_products,
+        format_values,
         format_verdict,
         registration_remarks,
         rich_table,
@@ -76,6 +77,7 @@ def _show_run(context: CommandContext, folder: Path) -> None:
         context.show(rich_table(rounds_table(gains)))
     if run.loops:
         context.show(rich_table(strehl_table(run.loops)))
+    context.show(*format_values(document))
     context.show(*format_criteria(document.get("criteria", [])), *format_verdict(document))
     context.show(*format_products(document["products"]))
     if resume and run.partial():
@@ -149,6 +151,11 @@ def report(
     from escape_hw.io.storage import refuse_existing
     from escape_hw.report.run_report import write_picture, write_report
 
+    if run.is_file():
+        raise ProductError(
+            f"{run}: a report is built of the folder of a run; "
+            f"'escape show {shlex.quote(str(run))}' summarises a product"
+        )
     refuse_existing(picture)
     path = write_report(run)
     old = read_result(run)

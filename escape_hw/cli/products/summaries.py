@@ -14,11 +14,14 @@ from rich.console import RenderableType
 from escape_hw.cli.formatting import format_calibration, profile_lines, registration_remarks, rich_table
 from escape_hw.errors import ProductError
 from escape_hw.io import documents
+from escape_hw.io.fits import file as fits_file
 from escape_hw.io.fits.frames import KIND_FRAMES, load_frames
 from escape_hw.io.fits.gains import KIND_GAINS, load_gains
 from escape_hw.io.fits.influence import KIND_INFLUENCE, load_influence
 from escape_hw.io.fits.loop import KIND_PSF, load_loop
 from escape_hw.io.fits.matrix import KIND_MATRIX, load_matrix
+from escape_hw.io.fits.offsets import KIND_OFFSETS, load_offsets
+from escape_hw.io.fits.pixels import PixelKind, load_pixels
 from escape_hw.io.fits.run_state import KIND_STATE, load_state
 from escape_hw.io.fits.telemetry import KIND_TELEMETRY, load_telemetry
 from escape_hw.report.tables import registration_table, rounds_table, strehl_table
@@ -112,12 +115,66 @@ def _state(file: Path) -> ProductSummary:
     return document, [f"a calibration by {method}, interrupted{frames}", f"resume with: {resume}"]
 
 
+def _pixels(kind: PixelKind) -> Callable[[Path], ProductSummary]:
+    name, unit = ("dark frame", " counts") if kind == "DARK" else ("relative response", "")
+
+    def summarise(file: Path) -> ProductSummary:
+        image = load_pixels(file, kind).result
+        rows, columns = image.shape
+        values = {
+            "mean": float(image.mean()), "scatter": float(image.std()),
+            "min": float(image.min()), "max": float(image.max()),
+        }  # fmt: skip
+        return {"shape": [rows, columns], **values}, [
+            f"{name} of {columns} x {rows} pixels: mean {values['mean']:.4g}{unit}, scatter "
+            f"{values['scatter']:.4g}{unit} rms, {values['min']:.4g} to {values['max']:.4g}{unit}"
+        ]
+
+    return summarise
+
+
+def _offsets(file: Path) -> ProductSummary:
+    offsets = load_offsets(file).result
+    peak = float(np.abs(offsets.flat).max(initial=0.0))
+    _, rows, columns = offsets.slopes.shape
+    document = {
+        "terms": dict(offsets.terms), "n_modes": offsets.modes.size, "slopes": [rows, columns],
+        "n_act": offsets.flat.size, "flat_peak": peak,
+    }  # fmt: skip
+    slopes = f"of {columns} x {rows} sub-apertures" if rows else "not measured"
+    flat = (
+        f"{offsets.flat.size} actuators, at most {peak:.3g} of full stroke" if offsets.flat.size else "zeros"
+    )
+    return document, [
+        *(f"{name}: {value:.6g} nm rms wavefront" for name, value in offsets.terms.items()),
+        f"offset of the reference slopes: {slopes}",
+        f"flat shape: {flat}",
+    ]
+
+
+def _screen(file: Path) -> ProductSummary:
+    hdus, _ = fits_file.read(file, fits_file.KIND_SCREEN)
+    panel = str(hdus[0].header.get("PANEL", ""))
+    arrays = [
+        {"name": hdu.name, "shape": list(hdu.shape), "unit": str(hdu.header.get("BUNIT", ""))}
+        for hdu in hdus[1:]
+    ]
+    return {"panel": panel, "arrays": arrays}, [
+        f"exported from the panel '{panel}' of the window",
+        *("{name}: {shape} {unit}".format_map(one).rstrip() for one in arrays),
+    ]
+
+
 _SUMMARIES: dict[str, Callable[[Path], ProductSummary]] = {
+    "DARK": _pixels("DARK"),
+    "FLAT": _pixels("FLAT"),
     KIND_FRAMES: _frames,
     KIND_GAINS: _gains,
     KIND_INFLUENCE: _influence,
     KIND_MATRIX: _matrix,
+    KIND_OFFSETS: _offsets,
     KIND_PSF: _loop,
+    fits_file.KIND_SCREEN: _screen,
     KIND_STATE: _state,
     KIND_TELEMETRY: _telemetry,
 }

@@ -42,6 +42,10 @@ def header_text(text: str) -> str:
     return "".join(c for c in escaped if c.isprintable())
 
 
+#: Kind of what a panel of the window shows, not a calibration product.
+KIND_SCREEN = "SCREEN"
+
+
 def primary_hdu(
     kind: str, system: str, simulated: bool, partial: bool, origin: Provenance
 ) -> fits.PrimaryHDU:

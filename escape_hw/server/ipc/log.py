@@ -10,6 +10,7 @@ from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
 
+from escape_hw.errors import StorageError
 from escape_hw.io.provenance import format_utc
 from escape_hw.remote.state import LogLine
 
@@ -53,18 +54,29 @@ class ServerLog:
     """Numbers, stores and publishes the lines of front end and engine, in the thread that creates it.
 
     Lines of other threads, for example that of the check of keys, wait for :meth:`flush`.
+
+    Raises
+    ------
+    StorageError
+        The file cannot be written.
     """
 
     def __init__(self, path: Path, publish: Callable[[LogLine], object], first_number: int = 0) -> None:
-        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._file = logging.handlers.RotatingFileHandler(
+                path, maxBytes=_BYTES, backupCount=_FILES, encoding="utf-8"
+            )
+        except OSError as error:
+            raise StorageError(
+                f"{path}: the log of the server cannot be written ({error.strerror or error}); "
+                "make its folder writable, or set XDG_DATA_HOME to another one"
+            ) from error
         self._lines: deque[LogLine] = deque(maxlen=_LINES)
         self._next, self._publish = first_number, publish
         self._thread, self._waiting = threading.get_ident(), deque[LogLine]()
         #: Number of the newest line; -1 if there is none.
         self.last_number = -1
-        self._file = logging.handlers.RotatingFileHandler(
-            path, maxBytes=_BYTES, backupCount=_FILES, encoding="utf-8"
-        )
         self._level = logging.getLogger("escape_hw").level
         self._handler = forward_log(self.add)
 
