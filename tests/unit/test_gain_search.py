@@ -85,6 +85,40 @@ def test_the_error_of_the_best_gain_is_correct(strehl_sigma):
     assert 0.4 < np.sqrt(np.mean(np.square(pulls))) < 1.5
 
 
+#: Gains, Strehl ratios and their errors of a scan on ``razor-shwfs``; the last but one is best by chance.
+SCATTERED = (
+    (0.2276, 0.1506, 0.028), (0.3186, 0.2653, 0.0211), (0.4096, 0.2685, 0.0126),
+    (0.5007, 0.2846, 0.0147), (0.5917, 0.3353, 0.0117), (0.6827, 0.3272, 0.0216),
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("change", [-0.002, 0.0, 0.002])
+def test_a_small_change_of_the_runs_changes_the_gain_a_little(change):
+    runs = []
+    for gain, value, sigma in SCATTERED:
+        ratio = Estimate(value + change * (gain == 0.6827), sigma)
+        runs.append(replace(LOOP, gain=gain, strehl=StrehlEstimate(ratio, ratio, ratio)))
+    assert gain_search._fit_peak(runs)[0] == pytest.approx(0.68, abs=0.01)
+
+
+def test_a_parabola_that_rises_beyond_the_last_run_is_followed(monkeypatch):
+    known = {gain: Estimate(value, sigma) for gain, value, sigma in SCATTERED}
+
+    def loop(bench, matrix, grid, *, gain, **options):
+        ratio = known.get(gain, Estimate(0.31, 0.01))
+        ratios = StrehlEstimate(ratio, ratio, ratio)
+        return replace(fake_results.loop(), gain=gain, strehl=ratios, partial=False)
+        yield
+
+    monkeypatch.setattr(gain_search, "close_loop", loop)
+    scan = tuple(known)
+    monkeypatch.setattr(gain_search, "GAIN_FRACTIONS", scan)
+    monkeypatch.setattr(gain_search, "gain_limit", lambda delay: 1.0)
+    found = run(gain_search.find_best_gain(None, fake_results.matrix(), None))
+    assert [one.gain for one in found.runs] == [*scan, pytest.approx(1.2 * scan[-1])]
+    assert scan[-2] < found.gain < 1.2 * scan[-1]
+
+
 def test_few_runs_give_the_best_of_them_and_the_distance_of_its_neighbours():
     gain, sigma = fitted(0.003, gains=GAINS[1:4])
     assert gain == GAINS[3]

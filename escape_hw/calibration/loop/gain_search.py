@@ -24,6 +24,8 @@ GAIN_FRACTIONS = (0.25, 0.35, 0.45, 0.55, 0.65, 0.75)
 #: Further gains tried while the best one lies at an end of the scan, and the ratios between them: small
 #: upwards, where the limit of stability is near.
 _MAX_EXTRA_GAINS, _STEP_UP, _STEP_DOWN = 4, 1.2, 1 / 1.5
+#: Fewest runs through which a parabola is fitted.
+_MIN_PARABOLA_RUNS = 4
 #: Delay assumed for the largest stable gain when the matrix has no measured one.
 _DEFAULT_DELAY_FRAMES = 2.0
 #: A run that is worse than the best by d deviates from a parabola about the top by this times d.
@@ -111,32 +113,56 @@ def find_best_gain(
 
 
 def _next_gain(runs: list[LoopResult]) -> float | None:
-    """A gain beyond the end of the scan at which the best run lies; ``None`` if it lies within the scan."""
+    """A gain beyond the end of the scan where the best one seems to lie; ``None`` if it lies within the scan.
+
+    It lies where the best run is, or the top of the parabola: the Strehl ratios of short runs scatter by more
+    than those of neighbouring gains differ.
+    """
     by_gain = sorted(runs, key=lambda run: run.gain)
     stable = [run for run in by_gain if run.stable]
-    best = stable[int(np.argmax(_compute_merits(stable)[0]))] if stable else None
-    if best is None or best is by_gain[0]:
+    if not stable:
         return by_gain[0].gain * _STEP_DOWN
-    return best.gain * _STEP_UP if best is by_gain[-1] else None
+    merits = _compute_merits(stable)[0]
+    best = stable[int(np.argmax(merits))]
+    top = _fit_parabola(stable)[0] if _allows_parabola(merits) else best.gain
+    if best is by_gain[0] or top < by_gain[0].gain:
+        return by_gain[0].gain * _STEP_DOWN
+    last = by_gain[-1]
+    return last.gain * _STEP_UP if last.stable and (best is last or top > last.gain) else None
 
 
 def _fit_peak(runs: list[LoopResult]) -> tuple[float, float]:
-    """Gain of the highest merit and its standard error.
+    """Gain of the highest merit and its standard error: the top of a parabola.
 
-    A parabola is fitted to the merits. Each run is weighted by its standard error and by the deviation of
-    the curve from a parabola, which grows with the distance from the top, so that runs far below the top do
-    not displace it. With fewer than four runs, or if the parabola has no top among the gains, the result is
-    the gain of the best run, with the error of a uniform distribution between its neighbours.
+    If the top lies beyond the gains, the result is the gain at that end; with few runs, or equal ones, that
+    of the best run. The error then is that of a uniform distribution between the neighbours.
     """
     runs = sorted(runs, key=lambda run: run.gain)
     gains = np.array([run.gain for run in runs])
+    merits, _ = _compute_merits(runs)
+    nearest = int(np.argmax(merits))
+    if _allows_parabola(merits):
+        top, sigma = _fit_parabola(runs)
+        if gains[0] <= top <= gains[-1]:
+            return top, sigma
+        nearest = 0 if top < gains[0] else gains.size - 1
+    below, above = max(nearest - 1, 0), min(nearest + 1, gains.size - 1)
+    return float(gains[nearest]), float(gains[above] - gains[below]) / math.sqrt(12) or math.nan
+
+
+def _allows_parabola(merits: NDArray[np.float64]) -> bool:
+    return merits.size >= _MIN_PARABOLA_RUNS and bool(np.ptp(merits) > 0)
+
+
+def _fit_parabola(runs: list[LoopResult]) -> tuple[float, float]:
+    """Top of a parabola through the merits, and its standard error; infinite if it has no top.
+
+    Each run is weighted by its standard error and by the deviation of the curve from a parabola, which grows
+    with the distance from the top, so that runs far below the top do not displace it.
+    """
+    gains = np.array([run.gain for run in runs])
     merits, errors = _compute_merits(runs)
-    best = int(np.argmax(merits))
-    below, above = max(best - 1, 0), min(best + 1, gains.size - 1)
-    best_run = float(gains[best]), float(gains[above] - gains[below]) / math.sqrt(12) or math.nan
-    spread = float(np.ptp(merits))
-    if gains.size < 4 or not spread > 0:
-        return best_run
+    best, spread = int(np.argmax(merits)), float(np.ptp(merits))
     known = bool(np.isfinite(errors).all())
     statistical = np.maximum(errors, 1e-3 * spread) if known else np.full(gains.size, _NOMINAL_ERROR * spread)
     weight = 1 / np.hypot(statistical, _PARABOLA_MISFIT * (merits[best] - merits))
@@ -146,9 +172,9 @@ def _fit_peak(runs: list[LoopResult]) -> tuple[float, float]:
     covariance = np.linalg.inv(design.T @ design)
     coefficients = covariance @ (design.T @ (merits * weight))
     _, slope, curvature = coefficients
-    top = -slope / (2 * curvature) if curvature < 0 else math.inf
-    if not position[0] <= top <= position[-1]:
-        return best_run
+    if not curvature < 0:
+        return math.copysign(math.inf, slope), math.nan
+    top = -slope / (2 * curvature)
     chi_squared = float(np.square(merits * weight - design @ coefficients).sum()) / (gains.size - 3)
     covariance *= max(chi_squared, 1.0) if known else chi_squared
     derivative = np.array([0.0, -1.0, -2 * top]) / (2 * curvature)
