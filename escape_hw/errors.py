@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import traceback
-from pathlib import Path
+from os.path import basename
 
 
 class EscapeError(Exception):
@@ -115,4 +115,4 @@ class ServerFull(RequestRefused):
 def raised_at(error: BaseException) -> str:
     """Where an exception of somebody else's code was raised: `` (acme.py, line 12)``; empty if unknown."""
     frames = traceback.extract_tb(error.__traceback__)
-    return f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno})" if frames else ""
+    return f" ({basename(frames[-1].filename)}, line {frames[-1].lineno})" if frames else ""

@@ -340,7 +340,7 @@ def test_full_disk_leaves_the_old_product(saved, small, monkeypatch, call):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(storage.os, call, full)
-    with pytest.raises(StorageError, match=r"im\.fits: .*No space left.*--out"):
+    with pytest.raises(StorageError, match=r"im\.fits: .*No space left.*choose another folder"):
         save_matrix(saved, small)
     monkeypatch.undo()
     assert_old_one_stands(saved, before)
@@ -373,7 +373,7 @@ def test_no_permission_names_the_path(small, monkeypatch, tmp_path):
         raise PermissionError(errno.EACCES, "Permission denied")
 
     monkeypatch.setattr(storage.tempfile, "mkstemp", refuse)
-    with pytest.raises(StorageError, match=r"im\.fits: .*--out"):
+    with pytest.raises(StorageError, match=r"im\.fits: .*choose another folder"):
         save_matrix(tmp_path / "im.fits", small)
     (tmp_path / "file").write_text("")
     with pytest.raises(StorageError, match="file"):

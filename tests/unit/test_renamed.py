@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 import escape_hw
 from escape_hw.api.adaptive_secondary import ShellState
-from escape_hw.calibration.acquisition.checkpoint import _require_same_run
+from escape_hw.calibration.acquisition.checkpoint import require_same_run
 from escape_hw.cli.app import app
 from escape_hw.config.bundled import bundled_text
 from escape_hw.config.key_tree import all_keys, locate_key
@@ -165,12 +165,12 @@ def test_a_checkpoint_of_0_1_0_is_of_the_same_run(tmp_path: Path) -> None:
         saved = saved.replace(new, old)
     identity = {"system": "x", "simulated": True, "method": "docrime", "settings": {}, "basis": "0"}
     state = tmp_path / "run.state"
-    _require_same_run(state, {**identity, "configuration": saved}, {**identity, "configuration": now})
+    require_same_run(state, {**identity, "configuration": saved}, {**identity, "configuration": now})
     other = saved.replace('solver = "effects"', 'solver = "light"')
     with pytest.raises(IncompatibleProduct, match=r"differs from this run's in calibration\.solver;"):
-        _require_same_run(state, {**identity, "configuration": other}, {**identity, "configuration": now})
+        require_same_run(state, {**identity, "configuration": other}, {**identity, "configuration": now})
     with pytest.raises(IncompatibleProduct, match="is not valid in this version"):
-        _require_same_run(
+        require_same_run(
             state, {**identity, "configuration": "schema = 2"}, {**identity, "configuration": now}
         )
 
