@@ -67,7 +67,7 @@ def frame(
 
 def test_the_shadow_is_found_where_it_is() -> None:
     errors = []
-    for seed in range(6):
+    for seed in range(3):
         rng = np.random.default_rng(seed)
         place = rng.uniform(-0.3, 0.3, 2)
         image = frame(NOMINAL + place, rng, 0.0).astype(float)
@@ -105,7 +105,7 @@ def test_the_mean_position_has_the_stated_error(depth: float, unevenness: float,
 
 def test_a_contaminated_rim_shifts_its_circle_but_not_the_images() -> None:
     rim, shadow, stated = [], [], []
-    for seed in range(6):
+    for seed in range(3):
         rng = np.random.default_rng(seed)
         centres = NOMINAL + rng.uniform(-0.4, 0.4, (4, 2))
         image = frame(centres, rng, 0.02)
