@@ -183,7 +183,8 @@ class WindowController(QObject):
     def _connection_failed(self, reason: str) -> None:
         title = _NO_SERVER
         if self.local_server is not None:
-            title, reason = "The server did not start", self.local_server.exit_message
+            title = "The server did not start" if self._live is None else "The server ended"
+            reason = self.local_server.exit_message
         # Every attempt fails with a reason; one that is known already is not repeated.
         known, self.failure = self.failure, reason
         if reason and reason != known:
@@ -222,7 +223,7 @@ def run(system: str, address: str, screenshot: Path | None, reset_settings: bool
     Returns
     -------
     int
-        Exit code.
+        Exit code; 1 if the window was closed before its image was saved into ``screenshot``.
 
     Raises
     ------
@@ -263,7 +264,7 @@ def run(system: str, address: str, screenshot: Path | None, reset_settings: bool
             code = qt_app.exec()
         if shot is not None and shot.error is not None:
             raise shot.error
-        return code
+        return code if shot is None or shot.saved else 1
     finally:
         session.close()
         controller.close()
@@ -306,12 +307,13 @@ def _close_on_signals(window: MainWindow) -> Iterator[None]:
 class Screenshot(QObject):
     """Saves an image of a window once the engine has started or a recording is open, and closes the window.
 
-    ``error`` is set if there is no server or the file cannot be written.
+    ``saved`` is true once the image is written; ``error`` is set if there is no server or it cannot be.
     """
 
     def __init__(self, window: MainWindow, controller: WindowController, path: Path) -> None:
         super().__init__(window)
         self.error: EscapeError | None = None
+        self.saved = False
         self._window, self._controller, self._path = window, controller, path
         self._deadline_s = time.monotonic() + _SCREENSHOT_TIMEOUT_S
         self._poll = QTimer(self)
@@ -333,6 +335,7 @@ class Screenshot(QObject):
         # Qt swallows an exception of a slot: the window would stay open.
         try:
             save_png(self._path, self._window)
+            self.saved = True
         except EscapeError as error:
             self.error = error
         finally:

@@ -243,11 +243,11 @@ class Camera(Device):
         if not self._running:
             self._delivered = self._lost = self._timeouts = 0
             self._last_index = None
+            region = self._settings_in_force().region
+            self._frame_shape = (region.height, region.width)
             with self._driver_calls:
                 self._start()
             self._running = True
-            region = self._settings_in_force().region
-            self._frame_shape = (region.height, region.width)
 
     @final
     def stop(self) -> None:

@@ -19,7 +19,7 @@ T = TypeVar("T")
 
 
 class _DriverCalls:
-    """Context in which hooks are called: any exception but ESCAPE's becomes a defect of the driver."""
+    """Context in which hooks are called: any exception of its own becomes a defect of the driver."""
 
     def __init__(self, device: Device) -> None:
         self._device = device
@@ -30,7 +30,7 @@ class _DriverCalls:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if isinstance(error, Exception) and not isinstance(error, EscapeError):
+        if isinstance(error, Exception) and not isinstance(error, EscapeError | MemoryError):
             log.info("%s: exception of its driver", self._device.name, exc_info=error)
             text = f"failed with {type(error).__name__}: {error}{raised_at(error)}"
             raise self._device.driver_defect(text) from error

@@ -311,7 +311,8 @@ class CommandContext:
                 folder.write_config(config.to_toml())
                 yield folder
         except StorageError as error:
-            error.add_note("--out chooses the folder of a run")
+            if self.folder is None or str(self.folder.path) in str(error):
+                error.add_note("--out chooses the folder of a run")
             raise
 
     def bench(self, selection: SystemSelection) -> AbstractContextManager[System]:

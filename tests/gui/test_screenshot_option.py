@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import recorded_run
 from gui_windows import dispose
+from PySide6.QtCore import QTimer
 
 from escape_gui import app
 from escape_gui.client import connection
@@ -45,6 +46,22 @@ def test_an_image_of_a_recording_is_saved(folder: Path, tmp_path: Path, escape: 
     image = tmp_path / "window.png"
     assert escape("replay", folder, "--screenshot", image)[0] == 0
     assert image.read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_window_that_is_closed_before_leaves_no_image(
+    folder: Path, tmp_path: Path, escape: Escape, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(app, "_SCREENSHOT_DELAY_MS", 60_000)
+    make = app.MainWindow
+
+    def closes_soon(*arguments: object) -> MainWindow:
+        window = make(*arguments)
+        QTimer.singleShot(300, window.close_without_question)
+        return window
+
+    monkeypatch.setattr(app, "MainWindow", closes_soon)
+    assert escape("replay", folder, "--screenshot", tmp_path / "window.png")[0] == 1
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.timeout(30)

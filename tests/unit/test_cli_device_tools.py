@@ -251,8 +251,9 @@ def lose_the_camera() -> None:
     ("happening", "code", "kind"),
     [(interrupt, 130, "Aborted"), (interrupt_twice, 130, "Aborted"), (lose_the_camera, 3, "DeviceLost")],
 )
+@pytest.mark.parametrize("stops", [True, False])
 def test_snap_saves_the_frames_before_an_interruption(
-    document, tmp_path: Path, monkeypatch, happening, code, kind
+    document, tmp_path: Path, monkeypatch, happening, code, kind, stops
 ):
     take = Camera.next_frame
 
@@ -263,6 +264,9 @@ def test_snap_saves_the_frames_before_an_interruption(
 
     monkeypatch.setattr(Camera, "next_frame", next_frame)
     monkeypatch.setattr("escape_hw.api.procedure.Reporter.PERIOD_S", 0.0)
+    if not stops:
+        # A camera that is gone cannot be stopped, either.
+        monkeypatch.setattr(Camera, "_before_close", lambda self: lose_the_camera())
     found = document("camera", "snap", "razor-shwfs", "--frames", 50, "--out", tmp_path / "frames.fits")
     assert (found[0], found[1]["error"]["type"]) == (code, kind)
     file = tmp_path / "frames.partial.fits"

@@ -11,6 +11,7 @@ import pytest
 from escape_hw.api.procedure import run
 from escape_hw.api.results import Estimate, StrehlEstimate
 from escape_hw.calibration.loop import gain_search
+from escape_hw.config.system import MAX_GAIN
 from escape_hw.errors import CalibrationError
 
 
@@ -117,6 +118,20 @@ def test_a_parabola_that_rises_beyond_the_last_run_is_followed(monkeypatch):
     found = run(gain_search.find_best_gain(None, fake_results.matrix(), None))
     assert [one.gain for one in found.runs] == [*scan, pytest.approx(1.2 * scan[-1])]
     assert scan[-2] < found.gain < 1.2 * scan[-1]
+
+
+def test_no_gain_beyond_the_largest_allowed_is_tried(monkeypatch):
+    def loop(bench, matrix, grid, *, gain, **options):
+        assert gain <= MAX_GAIN
+        return replace(fake_results.loop(), gain=gain, strehl=None, residual_rms_nm=50 / gain, partial=False)
+        yield
+
+    monkeypatch.setattr(gain_search, "close_loop", loop)
+    found = run(gain_search.find_best_gain(None, fake_results.matrix(), None, gains=None))
+    monkeypatch.setattr(gain_search, "gain_limit", lambda delay: 2.0)
+    fast = run(gain_search.find_best_gain(None, fake_results.matrix(), None))
+    assert fast.gain == max(one.gain for one in fast.runs) == pytest.approx(1.8)
+    assert found.gain < fast.gain
 
 
 def test_few_runs_give_the_best_of_them_and_the_distance_of_its_neighbours():

@@ -50,6 +50,13 @@ def test_loops_too_short_for_a_strehl_ratio_are_refused_before_anything_opens(es
     assert f"the least is --frames {least}" in err
 
 
+@pytest.mark.parametrize(("system", "matrices"), [("razor-shwfs", 3), ("razor-pywfs", 6)])
+def test_fewer_trials_than_matrices_are_refused_before_these_are_measured(escape, system, matrices):
+    code, _, err = escape("sweep", system, "--trials", matrices - 1)
+    assert code == 2
+    assert f"--trials {matrices - 1}: fewer than the {matrices} matrices" in " ".join(err.split())
+
+
 def test_the_least_loop_has_a_strehl_ratio_with_an_error():
     with escape_hw.open_system("razor-shwfs", set=SMALL) as bench:
         found, psf = bench.calibrate("push-pull"), bench.take_model_psf()

@@ -16,6 +16,7 @@ from escape_hw.api.results import LoopResult
 from escape_hw.api.sensor import SensorGeometry
 from escape_hw.bench import Bench
 from escape_hw.calibration.loop.performance import close_loop
+from escape_hw.config.system import MAX_GAIN
 from escape_hw.errors import CalibrationError
 from escape_hw.pipeline.control.integrator import gain_limit
 
@@ -127,8 +128,8 @@ def _next_gain(runs: list[LoopResult]) -> float | None:
     top = _fit_parabola(stable)[0] if _allows_parabola(merits) else best.gain
     if best is by_gain[0] or top < by_gain[0].gain:
         return by_gain[0].gain * _STEP_DOWN
-    last = by_gain[-1]
-    return last.gain * _STEP_UP if last.stable and (best is last or top > last.gain) else None
+    last, above = by_gain[-1], by_gain[-1].gain * _STEP_UP
+    return above if last.stable and (best is last or top > last.gain) and above <= MAX_GAIN else None
 
 
 def _fit_peak(runs: list[LoopResult]) -> tuple[float, float]:

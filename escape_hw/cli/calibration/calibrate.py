@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 from dataclasses import replace
+from datetime import datetime
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -94,6 +95,8 @@ def _suggest_resume(context: CommandContext, error: BaseException, request: Cali
     resumable = next((folder for folder in folders if (folder / STATE_FILE).is_file()), None)
     if resumable is not None:
         words = ["escape", "calibrate", "--resume", str(resumable), *(["--force"] if request.force else [])]
+        saved = datetime.fromtimestamp((resumable / STATE_FILE).stat().st_mtime)
+        error.add_note(f"its state was saved at {saved:%H:%M:%S}")
         error.add_note(f"resume with: {shlex.join(words)}")
 
 

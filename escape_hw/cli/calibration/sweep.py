@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Mapping, Sequence
-from contextlib import closing
+from contextlib import closing, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -143,10 +143,11 @@ def sweep(
             dict(sampler=sampler, metric=metric, margin=margin / 100, storage=storage, study=study),
             force,
         )  # fmt: skip
-    # The workers are opened first: a scheduler that does not answer is found before the calibrations.
+    # The workers are opened first: a scheduler that does not answer is found before the calibrations. A sweep
+    # on hardware has none.
     with (
         context.run_folder(config, "sweep", out) as folder,
-        closing(open_workers(workers, scheduler)) as pool,
+        closing(open_workers(workers, scheduler)) if config.simulated else nullcontext() as pool,
     ):
         _run(context, selection, given, folder, pool)
 
@@ -176,6 +177,11 @@ def _read_request(
         raise ConfigError("--gains needs --im: optical gains belong to existing matrices")
     products = [load_fitting_matrix(path, config, force) for path in im]
     variants = [MatrixVariant(one.path.stem, False, one.path, one.sha256) for one in products]
+    if not products:
+        # Those that are measured: three matrices, on a pyramid also scaled by their optical gains.
+        scaled = (False, True) if config.sensor.kind == "pyramid" else (False,)
+        names = ("push-pull", "DO-CRIME", "ESCAPE")
+        variants = [MatrixVariant(name, gained, Path(), "") for name in names for gained in scaled]
     storage = study["storage"] or "sqlite://"
     new_description(
         config, variants, space, design,
@@ -194,7 +200,7 @@ def _run(
     selection: options.SystemSelection,
     sweep: SweepDescription | _Request,
     folder: RunFolder,
-    pool: Workers,
+    pool: Workers | None,
 ) -> None:
     """Run a new sweep or what is left of one, and save its result in the folder."""
     from escape_hw.runtime.session.record import BenchRecord
@@ -211,9 +217,9 @@ def _run(
             if isinstance(sweep, _Request)
             else sweep
         )
-        if not bench.simulated:
+        if pool is None:
             result, stop = context.run_keeping_partial(sweep_and_analyse(description, bench))
-    if description.sweep.simulated:
+    if pool is not None:
         result, stop = context.run_keeping_partial(sweep_and_analyse(description, pool))
     with context.protect_saving(stop):
         _save(context, folder, record, description, result)

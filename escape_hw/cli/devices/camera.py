@@ -58,17 +58,20 @@ def snap(
     _require_room(out, frames, None if chosen.section is None else chosen.section.settings().region)
     recorded: list[Frame] = []
     stop: EscapeError | None = None
-    with context.open_protected(device, DEVICE_CLOSING):
-        settings, changed = _apply_configuration(context, chosen)
-        info = device.info
-        _require_room(out, frames, settings.region)
-        try:
-            context.run(grab_frames(device, frames, _timeout_s(chosen), recorded))
-        except EscapeError as error:
-            if not recorded:
-                raise
-            stop = error
-        status = device.status()
+    try:
+        with context.open_protected(device, DEVICE_CLOSING):
+            settings, changed = _apply_configuration(context, chosen)
+            info = device.info
+            _require_room(out, frames, settings.region)
+            try:
+                context.run(grab_frames(device, frames, _timeout_s(chosen), recorded))
+            finally:
+                status = device.status()
+    except EscapeError as error:
+        # A camera that is lost may fail again while it is closed.
+        if not recorded:
+            raise
+        stop = error
     with context.protect_saving(stop):
         if out is not None:
             out = _save(out, recorded, info, settings, chosen.config, partial=stop is not None)

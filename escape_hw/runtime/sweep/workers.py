@@ -166,20 +166,23 @@ class DaskWorkers(Workers):
 
     def _open_executor(self) -> Executor:
         deadline = time.monotonic() + SCHEDULER_TIMEOUT_S
+        try:
+            self._dask.comm.get_address_host_port(self.address)
+        except ValueError as error:
+            raise ConfigError(
+                f"--scheduler {self.address}: {error}; it is of the form tcp://host:8786"
+            ) from error
         while True:
             try:
                 self._client = self._dask.Client(self.address, timeout=5, set_as_default=False)
                 executor: Executor = self._client.get_executor(pure=False)
                 return executor
-            except ValueError as error:
-                raise ConfigError(
-                    f"--scheduler {self.address}: {error}; it is of the form tcp://host:8786"
-                ) from error
             except (OSError, TimeoutError) as error:
                 if self._closed or time.monotonic() > deadline:
                     raise CalibrationError(
                         f"no Dask scheduler answers at {self.address} for {SCHEDULER_TIMEOUT_S:.0f} s; start "
-                        "one (dask scheduler) and workers (dask worker --nthreads 1), then resume"
+                        "one (dask scheduler) and workers (dask worker --nthreads 1), then start or resume "
+                        "the sweep"
                     ) from error
                 log.warning("no Dask scheduler at %s; trying again", self.address)
                 time.sleep(1.0)
