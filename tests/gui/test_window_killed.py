@@ -66,19 +66,15 @@ def test_a_window_that_dies_does_not_disturb_the_loop(number: int, tmp_path: Pat
             advances(bench, 500)
             windows.append(window(served))
             following = f"process {windows[1].pid})"
-            seconds = wait_for(
+            wait_for(
                 lambda: any(following in line.text for line in bench.log_after(-1)), "attached", ATTACH_S
             )
-            print(f"the next window was attached {seconds:.1f} s after its start")
-            assert seconds < 20, "two seconds on an idle machine"
             advances(bench, 200)
             if number == signal.SIGSTOP:
                 # A resumed window reconnects at once.
                 wait_for(lambda: bench.state.clients == alone + 1, "nobody counts it any more")
                 os.kill(windows[0].pid, signal.SIGCONT)
-                seconds = wait_for(lambda: bench.state.clients == alone + 2, "it is heard again", ATTACH_S)
-                print(f"the halted window was heard {seconds:.1f} s after it went on")
-                assert seconds < 20, "two seconds on an idle machine"
+                wait_for(lambda: bench.state.clients == alone + 2, "it is heard again", ATTACH_S)
             bench.open_loop()
         finally:
             for one in windows:
