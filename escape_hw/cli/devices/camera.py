@@ -227,7 +227,7 @@ def _requested_changes(
 
 
 def _parse_region(text: str, section: CameraConfig | None) -> Region:
-    """A region that lies on the sensor, as far as it is known."""
+    """A region within the sensor; without a system the sensor is not known, and only the form is checked."""
     from escape_hw.api.camera import Region
 
     parts = text.split(",")
