@@ -79,6 +79,7 @@ def test_close_the_loop(tmp_path: Path) -> None:
         assert 5 < number(rf"Strehl ratio, {way}: ([\d.]+) ±", out) < 100
 
 
+@pytest.mark.slow
 def test_own_procedure(tmp_path: Path) -> None:
     out = run("own_procedure.py", tmp_path)
     response = [float(value) for value in re.findall(r"response ([\d.]+)", out)]

@@ -95,6 +95,7 @@ def test_fast_push_pull_in_closed_loop(closed_loop, truth):
     assert found.matrix.snr().min() > 5
 
 
+@pytest.mark.slow
 def test_fast_push_pull_under_turbulence_in_open_loop(good):
     with small(NO_LOSS) as bench:
         found = bench.run(docrime(bench, frames=2000, poke=0.01, grid=good.grid, pattern=PushPullPokes))

@@ -202,6 +202,7 @@ def test_an_abort_opens_it(bench, good):
     assert caught.value.partial.frames > 100
 
 
+@pytest.mark.slow
 def test_a_measurement_continues_from_the_loops_own_matrix(bench, good):
     loop_control = LoopControl(bench, good.run.result)
     found = bench.run(

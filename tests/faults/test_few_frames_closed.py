@@ -35,6 +35,7 @@ def pull(found) -> np.ndarray:
     return (found.registration.registration.to_array() - INJECTED) / found.registration.sigma
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seeds", SEEDS, ids=["one", "four"])
 @pytest.mark.parametrize(
     "name",

@@ -42,6 +42,7 @@ def runs(good):
 LOSSES = pytest.mark.parametrize("loss", [pytest.param(0.01, marks=pytest.mark.slow), 0.1])
 
 
+@pytest.mark.slow
 @LOSSES
 def test_the_same_matrix_within_its_noise(good, runs, loss):
     for run in runs(loss):
@@ -107,6 +108,7 @@ def test_every_tenth_frame_lost_by_the_camera(good):
     assert gain == pytest.approx(1, abs=0.02)
 
 
+@pytest.mark.slow
 def test_push_pull_under_loss(good):
     found = []
     for loss in (0.0, 0.1):

@@ -107,6 +107,7 @@ def test_a_mirror_that_is_not_in_the_beam_stops_the_other_methods_too():
         assert_flat(bench)
 
 
+@pytest.mark.slow
 def test_a_faint_response_shows_in_its_errors():
     """Just seen, a matrix comes out with errors as large as itself, and a note."""
     with small("devices.dm.stroke_m=3e-8") as bench:

@@ -39,7 +39,7 @@ def test_the_frames_err_less_than_the_sums_of_a_matrix():
     assert ratio[:3].mean() < 0.9
 
 
-@pytest.mark.parametrize(("frames", "fitted"), [(120, 1), (310, 0)])
+@pytest.mark.parametrize(("frames", "fitted"), [(120, 1), pytest.param(310, 0, marks=pytest.mark.slow)])
 def test_the_frames_are_fitted_up_to_ten_per_mode(monkeypatch, frames, fitted):
     asked, real = [], procedure.fit_recorded_frames
 

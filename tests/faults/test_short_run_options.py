@@ -34,7 +34,8 @@ def test_a_signal_to_noise_ratio_is_refused_before_anything_moves(loop):
 
 
 @pytest.mark.parametrize(
-    ("accuracy", "text"), [(50.0, "(reached)"), (1e-3, "(not reached; use more frames)")]
+    ("accuracy", "text"),
+    [pytest.param(50.0, "(reached)", marks=pytest.mark.slow), (1e-3, "(not reached; use more frames)")],
 )
 @pytest.mark.parametrize(
     "loop", ["open loop", pytest.param("closed loop", marks=pytest.mark.slow)], indirect=True

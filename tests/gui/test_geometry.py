@@ -333,6 +333,7 @@ def test_buttons_that_are_held_are_visible_in_the_narrowest_window(
     assert_is_in_its_dock(getattr(window.panels[panel], button), window, panel)
 
 
+@pytest.mark.slow
 def test_long_names_of_matrices_fit_the_narrowest_window(
     show: Show, source: ScriptedSource, tmp_path: Path, qtbot: QtBot
 ) -> None:

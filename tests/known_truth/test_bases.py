@@ -32,7 +32,7 @@ def calibrated(*more: str, frames: int = 400, estimator: str = "auto") -> Calibr
 
 
 @pytest.mark.parametrize(
-    "kind", ["kl", "zonal", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("zernike", "fourier"))]
+    "kind", ["zonal", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("kl", "zernike", "fourier"))]
 )
 def test_every_basis_gives_the_registration(kind):
     result = calibrated(f"basis.kind={kind}")
@@ -59,7 +59,15 @@ def test_few_frames_do_with_any_basis(kind):
     assert result.measured is None
 
 
-@pytest.mark.parametrize("solver", ["registration-only", "frozen-derivatives", "batches", "diagonal"])
+@pytest.mark.parametrize(
+    "solver",
+    [
+        "registration-only",
+        "batches",
+        pytest.param("frozen-derivatives", marks=pytest.mark.slow),
+        pytest.param("diagonal", marks=pytest.mark.slow),
+    ],
+)
 def test_every_solver_gives_the_registration(solver):
     # These know no unequal actuators and no other shape, so the mirror is like its model here.
     ideal = ("twin.mirror.shape=nominal", "twin.mirror.gain_scatter=0")

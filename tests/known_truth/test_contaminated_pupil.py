@@ -103,6 +103,7 @@ def test_the_mean_position_has_the_stated_error(depth: float, unevenness: float,
     assert 0.3 < np.mean(np.square(np.array(errors) / np.array(stated)[:, None])) < 2.5
 
 
+@pytest.mark.slow
 def test_a_contaminated_rim_shifts_its_circle_but_not_the_images() -> None:
     rim, shadow, stated = [], [], []
     for seed in range(3):
@@ -123,6 +124,7 @@ def test_a_contaminated_rim_shifts_its_circle_but_not_the_images() -> None:
     assert 0 < sigma[1] < 3 * by_shadow
 
 
+@pytest.mark.slow
 def test_large_images_are_binned() -> None:
     rng = np.random.default_rng(5)
     place = np.array([0.3, -0.2])

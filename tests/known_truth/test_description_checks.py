@@ -90,7 +90,7 @@ def test_a_wrong_pitch_is_named() -> None:
     assert any("larger on the sensor than described" in note for note in estimate.notes), estimate.notes
 
 
-@pytest.mark.parametrize("pattern", [0.0, 3.0])
+@pytest.mark.parametrize("pattern", [0.0, pytest.param(3.0, marks=pytest.mark.slow)])
 def test_an_idle_mirror_is_no_wrong_layout(pattern: float) -> None:
     """Noise alone, or with one pattern of slopes, by another amount in each column, that came by itself."""
     matrix, rng = measured(0), np.random.default_rng(0)
@@ -125,6 +125,7 @@ def test_a_clocking_that_may_be_chance_is_named_where_it_dominates_the_errors() 
     assert "are turned by 1.00 ± 0.30" in said
 
 
+@pytest.mark.slow
 def test_y_slopes_before_x_slopes_are_named() -> None:
     matrix = measured(0)
     x, y = np.split(matrix.data, 2)

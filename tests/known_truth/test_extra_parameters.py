@@ -149,6 +149,7 @@ def test_a_shear_stays_with_a_mirror_that_moves_on(model):
     assert np.abs(bare - with_shear).max() > 1e-2 * np.abs(with_shear).max()
 
 
+@pytest.mark.slow
 def test_shifted_pupil_images_are_distinguished_from_a_shifted_mirror_by_their_rims():
     config = small_pyramid()
     model = make_fast_model(config, None)

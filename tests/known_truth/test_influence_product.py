@@ -194,7 +194,9 @@ def test_a_fit_that_did_not_converge_is_not_written(
     assert not (tmp_path / "x.fits").exists()
 
 
-@pytest.mark.parametrize("fits", [True, False, None])
+@pytest.mark.parametrize(
+    "fits", [False, *(pytest.param(fits, marks=pytest.mark.slow) for fits in (True, None))]
+)
 def test_a_model_that_does_not_fit_is_said_where_the_file_is_used(
     found: InfluenceEstimate, fits: bool | None, caplog: pytest.LogCaptureFixture, escape: Any, tmp_path: Path
 ) -> None:
@@ -208,7 +210,10 @@ def test_a_model_that_does_not_fit_is_said_where_the_file_is_used(
     assert len(said) == (fits is False)
 
 
-@pytest.mark.parametrize(("simulated", "mode"), [(True, "hardware"), (False, "hardware"), (True, "sim")])
+@pytest.mark.parametrize(
+    ("simulated", "mode"),
+    [(True, "hardware"), (False, "hardware"), pytest.param(True, "sim", marks=pytest.mark.slow)],
+)
 def test_influence_functions_of_a_twin_are_told_from_those_of_a_real_mirror(
     found: InfluenceEstimate, simulated: bool, mode: str, caplog: pytest.LogCaptureFixture, tmp_path: Path
 ) -> None:

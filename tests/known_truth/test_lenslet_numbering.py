@@ -80,22 +80,19 @@ def test_a_region_that_cuts_the_pupil_leaves_the_numbering() -> None:
 @pytest.mark.parametrize(
     "amplitude",
     [
-        PUPIL * (np.hypot(X - 1.5, Y) <= 12),
-        PUPIL * (np.hypot(X - 3, Y) <= 12),
-        PUPIL * (X > -9),
-        PUPIL * ~((np.hypot(X, Y) > 9.6) & (np.abs(np.arctan2(Y, X)) < 0.9)),
-        PUPIL * beam(5),
-        PUPIL * beam(3),
-        np.ones_like(X),
-    ],
-    ids=[
-        "second aperture",
-        "second aperture far off",
-        "straight edge",
-        "opaque dirt",
-        "dim rim",
-        "dark rim",
-        "no rim",
+        pytest.param(PUPIL * (np.hypot(X - 1.5, Y) <= 12), id="second aperture"),
+        pytest.param(
+            PUPIL * (np.hypot(X - 3, Y) <= 12), id="second aperture far off", marks=pytest.mark.slow
+        ),
+        pytest.param(PUPIL * (X > -9), id="straight edge"),
+        pytest.param(
+            PUPIL * ~((np.hypot(X, Y) > 9.6) & (np.abs(np.arctan2(Y, X)) < 0.9)),
+            id="opaque dirt",
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(PUPIL * beam(5), id="dim rim", marks=pytest.mark.slow),
+        pytest.param(PUPIL * beam(3), id="dark rim", marks=pytest.mark.slow),
+        pytest.param(np.ones_like(X), id="no rim"),
     ],
 )
 def test_an_ambiguous_outline_is_stated(amplitude: NDArray[np.floating]) -> None:

@@ -106,6 +106,7 @@ def test_gains_of_the_bench_are_those_of_the_frozen_residuals() -> None:
         assert_true(*measured(bench, result, 6000, 40, every=6), every=6)
 
 
+@pytest.mark.slow
 def test_small_pokes_use_the_response_measured_with_larger_ones(
     bench: System, baseline: CalibrationResult
 ) -> None:

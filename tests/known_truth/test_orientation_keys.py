@@ -34,7 +34,7 @@ def fitted(*more: str) -> RegistrationEstimate:
 CASES = [
     "wfs.flip=left-right",
     *(pytest.param(f"wfs.flip={flip}", marks=pytest.mark.slow) for flip in FLIPS[2:]),
-    "mirror.order=turn-90",
+    pytest.param("mirror.order=turn-90", marks=pytest.mark.slow),
     "mirror.polarity=-1",
 ]
 
@@ -61,9 +61,8 @@ def test_what_is_not_described_is_refused_and_its_key_named(true: str) -> None:
     assert any(f"{key} = {quoted}" in warning for warning in found.warnings), found.warnings
 
 
-@pytest.mark.parametrize(
-    "true", [pytest.param("wfs.flip=turn-90", marks=pytest.mark.slow), "mirror.order=turn-90"]
-)
+@pytest.mark.parametrize("true", ["wfs.flip=turn-90", "mirror.order=turn-90"])
+@pytest.mark.slow
 def test_either_of_two_suggested_keys_fits(true: str) -> None:
     """Camera and numbering have the same effect on a matrix; the registration is turned with them."""
     text = " ".join(fitted(f"twin.{true}").warnings)
@@ -88,6 +87,7 @@ def test_suggestions_add_to_what_is_described_already() -> None:
     assert "and devices.dm.polarity = -1" in text
 
 
+@pytest.mark.slow
 def test_a_table_is_not_replaced_by_a_flip() -> None:
     straight = ",".join(map(str, range(37)))
     found = fitted("twin.wfs.flip=up-down", f"devices.dm.order='numbers:{straight}'")

@@ -189,6 +189,7 @@ def test_noise_makes_the_threshold_gradual(config):
     assert np.linalg.norm(sharp - want) > 2 * np.linalg.norm(found - want)
 
 
+@pytest.mark.slow
 def test_the_average_keeps_no_pattern_of_the_pixels(config):
     """A lattice of spots that is moved by half a pixel answers alike once the spots move by a pixel."""
     grid, _ = with_counts(config)

@@ -11,6 +11,7 @@ from escape_hw.calibration.docrime.response import LagSums, ResponseEstimate
 SEEDS = 16
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "gain",
     [

@@ -127,7 +127,10 @@ def test_ctrl_c_prints_the_command_to_resume(start, system, tmp_path):
     assert not any("resume with: " in line for line in ended.lines)
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT])
+@pytest.mark.parametrize(
+    "number",
+    [signal.SIGTERM, *(pytest.param(one, marks=pytest.mark.slow) for one in (signal.SIGHUP, signal.SIGQUIT))],
+)
 def test_a_stop_signal(start, system, tmp_path, number):
     out = tmp_path / "run"
     running = start("calibrate", system, "--method", "docrime", "--frames", ENDLESS, "--out", out)
@@ -139,7 +142,9 @@ def test_a_stop_signal(start, system, tmp_path, number):
     check_products(out, [], ["im"])
 
 
-@pytest.mark.parametrize("pause", [0.0, 0.03, 0.1])
+@pytest.mark.parametrize(
+    "pause", [0.03, *(pytest.param(pause, marks=pytest.mark.slow) for pause in (0.0, 0.1))]
+)
 def test_impatient_ctrl_c_never_leaves_half_a_product(start, system, tmp_path, pause):
     """However many come and whenever: exit code 130, and every file that is there is sound."""
     out = tmp_path / "run"

@@ -61,6 +61,7 @@ def test_a_campaign_without_a_finished_realisation_is_an_error(tmp_path):
         run(sky_time("razor-shwfs", realisations=4, frames=FRAMES, overrides=[str(tmp_path), "0"]))
 
 
+@pytest.mark.slow
 def test_a_campaign_without_accidents_has_no_note(tmp_path):
     curves = run(sky_time("razor-shwfs", realisations=5, frames=FRAMES, overrides=[str(tmp_path), "5"]))
     assert curves["realisations"] == 5

@@ -47,6 +47,7 @@ def test_a_matrix_needs_its_geometry() -> None:
         as_matrix_and_grid(fake.matrix(), None)
 
 
+@pytest.mark.slow
 def test_a_script_may_pass_what_it_loaded(tmp_path: Path) -> None:
     with escape_hw.open_system("razor-shwfs", set=SMALL) as bench:
         product = load_matrix(escape_hw.save_matrix(tmp_path / "im.fits", bench.calibrate(frames=400)))

@@ -109,6 +109,7 @@ def test_an_interrupted_calibration_in_another_basis_is_refused(document, tmp_pa
     assert (run / "run.state").read_bytes() == (OLD / "interrupted" / "run.state").read_bytes()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("undrawn")
 def test_an_interrupted_calibration_is_resumed(document, tmp_path, monkeypatch):
     """As one of a system whose modes are those of 0.1.0: here the response that a mode needs is the best.

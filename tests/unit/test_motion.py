@@ -52,7 +52,14 @@ def test_motion_pokes_and_what_lasts(memory: float, white: float) -> None:
     assert np.mean([f.n_effective for f in found]) == pytest.approx(0.85 * 1500 / integral, rel=0.3)
 
 
-@pytest.mark.parametrize(("tilt_memory", "most"), [(50.0, 22.0), (300.0, 9.0), (3000.0, 8.0)])
+@pytest.mark.parametrize(
+    ("tilt_memory", "most"),
+    [
+        pytest.param(50.0, 22.0, marks=pytest.mark.slow),
+        (300.0, 9.0),
+        pytest.param(3000.0, 8.0, marks=pytest.mark.slow),
+    ],
+)
 def test_tilts_that_outlast_the_other_slopes_count(tilt_memory: float, most: float) -> None:
     # 15, 3.1 and 1.2 independent realisations; what outlasts the run is in its mean and cannot be seen. The
     # slopes without the tilts have more than a hundred.

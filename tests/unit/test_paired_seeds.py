@@ -47,6 +47,7 @@ def test_every_matrix_of_a_seed_starts_from_the_same_state(document, bench, tmp_
     assert bench.benches[0].config.calibration.push_pull_frames == paired_seeds.PUSH_PULL_FRAMES
 
 
+@pytest.mark.slow
 def test_numbers_by_seed_are_saved_and_shown(escape, reports, bench, tmp_path):
     code, out, err = escape(*WORDS, *INJECTED, "--out", tmp_path / "run")
     assert code == 0, err

@@ -50,7 +50,7 @@ def test_pokes_in_turn_reach_less_than_all_at_once(bench: Bench) -> None:
     ("limits", "poke"),
     [
         (("devices.dm.limits.max_slew=0.2",), 0.005),
-        (("devices.dm.limits.max_neighbour=0.25",), 0.005),
+        pytest.param(("devices.dm.limits.max_neighbour=0.25",), 0.005, marks=pytest.mark.slow),
         (("calibration.poke_command=1.0",), 0.02),
     ],
     ids=["slew", "neighbours", "stroke"],

@@ -144,7 +144,7 @@ def test_escape_recovers_the_injected_registration(
     assert (np.abs(again - injected) < [5.0, 5.0, 0.2, 1.0, 1.0]).all()
 
 
-@pytest.mark.parametrize("whiten", [True, False])
+@pytest.mark.parametrize("whiten", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_a_method_is_the_procedure_of_that_name(whiten: bool) -> None:
     measured = []
     calls: list[Callable[[escape_hw.System], escape_hw.CalibrationResult]] = [

@@ -174,6 +174,7 @@ def test_neutral_colours_follow_the_page(page):
     assert "prefers-color-scheme: dark" in page
 
 
+@pytest.mark.slow
 def test_same_run_gives_the_same_page(tmp_path):
     folder = make_run(tmp_path / "run", lean=True)
     first = write_report(folder).read_bytes()

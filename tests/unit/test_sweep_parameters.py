@@ -57,6 +57,7 @@ def test_fewer_trials_than_matrices_are_refused_before_these_are_measured(escape
     assert f"--trials {matrices - 1}: fewer than the {matrices} matrices" in " ".join(err.split())
 
 
+@pytest.mark.slow
 def test_the_least_loop_has_a_strehl_ratio_with_an_error():
     with escape_hw.open_system("razor-shwfs", set=SMALL) as bench:
         found, psf = bench.calibrate("push-pull"), bench.take_model_psf()

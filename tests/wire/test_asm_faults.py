@@ -47,6 +47,7 @@ def ends_safe(fault: str) -> tuple[str, str, AsmEmulator]:
         return said, str(made.controller.shell.state), made
 
 
+@pytest.mark.slow
 def test_a_reset_at_every_call_ends_at_rest_and_is_reported() -> None:
     with ThreadPoolExecutor(12) as pool:
         results = list(pool.map(ends_safe, [f"reset@{n}" for n in range(N_CALLS)]))

@@ -54,6 +54,7 @@ def remote() -> Iterator[tuple[subprocess.Popen[str], int]]:
         yield process, int(found[1])
 
 
+@pytest.mark.slow
 def test_a_stopped_peer_is_reported_in_time_and_rests_when_it_continues(
     remote: tuple[subprocess.Popen[str], int],
 ) -> None:

@@ -14,6 +14,7 @@ from datetime import datetime
 from functools import partial
 from pathlib import Path
 
+import pytest
 from asm_bench import emulator, port_of, wait_for
 
 from escape_hw.api.adaptive_secondary import ShellState
@@ -101,6 +102,7 @@ def test_a_floating_shell_is_flattened_and_rested(tmp_path: Path) -> None:
         wait_for(lambda: made.controller.shell.state is ShellState.RESTED, "the shell is rested")
 
 
+@pytest.mark.slow
 def test_a_shell_rested_by_its_watchdog_is_not_lifted(tmp_path: Path) -> None:
     states = []
     with emulator(hold=1.0, rest=2.0) as made:

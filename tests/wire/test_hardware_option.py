@@ -42,6 +42,7 @@ def run(*words: object) -> subprocess.CompletedProcess[str]:
     )
 
 
+@pytest.mark.slow
 def test_only_devices_whose_serial_number_was_typed_are_touched(bench_file: Path) -> None:
     path = ROOT / "tests/contract/test_hardware.py"
     done = run(f"--hardware={bench_file}", "--serial", "SIM97", "--maxchange", 1, path)
