@@ -24,12 +24,12 @@ TRUTH = Registration(10.0, -8.0, 0.5, 1.0, -1.0)
 
 
 @cache
-def true_matrix() -> NDArray[np.float64]:
+def true_matrix(truth: Registration = TRUTH) -> NDArray[np.float64]:
     """A mirror with a ring around each of its actuators, which have places and gains of their own."""
     rng = np.random.default_rng(4)
     columns = []
     for actuator, (x, y) in enumerate(5 * rng.normal(size=(MODEL.n_act, 2))):
-        at = replace(TRUTH, shift_x=TRUTH.shift_x + x, shift_y=TRUTH.shift_y + y)
+        at = replace(truth, shift_x=truth.shift_x + x, shift_y=truth.shift_y + y)
         columns.append((MODEL.zonal_matrix(at) + 0.2 * MODEL.zonal_matrix(at, 2.2))[:, actuator])
     return np.stack(columns, axis=1) * (1 + 0.05 * rng.normal(size=MODEL.n_act))
 

@@ -162,6 +162,7 @@ class MixedEffectsProblem:
             earlier.variant_derivatives if earlier else VariantDerivatives(model, self.variants)
         )
         self.trends = slope_trends(model, weighted.valid)
+        self._mean_shape, self._mean_actuator = self._prior_mirror()
         self.precision = np.concatenate([
             np.zeros(6), [priors.width**-2], (priors.shape_scale * self.shape.prior_sigma) ** -2.0,
             scatters**-2,
@@ -176,14 +177,13 @@ class MixedEffectsProblem:
 
     def initial_state(self, registration: Registration) -> MixedEffectsState:
         """A registration, the gain that fits best there, and the prior means."""
-        n_act, n_slopes = self.model.n_act, self.weighted.data.shape[0]
+        n_slopes = self.weighted.data.shape[0]
         model = self.weighted.weigh(modal_matrix(self.model, registration, self.modes))
         gain = float(np.vdot(model, self.weighted.data) / np.vdot(model, model))
         return MixedEffectsState(
-            gain, registration.to_array(), self.priors.mean_width, np.zeros(self.shape.n_terms),
-            self._mean_variant.copy(),
-            np.zeros(self.n_lines), np.zeros(self.trends.shape[1]), np.zeros((N_ACTUATOR_EFFECTS, n_act)),
-            np.zeros(n_slopes),
+            gain, registration.to_array(), self.priors.mean_width, self._mean_shape.copy(),
+            self._mean_variant.copy(), np.zeros(self.n_lines), np.zeros(self.trends.shape[1]),
+            self._mean_actuator.copy(), np.zeros(n_slopes),
         )  # fmt: skip
 
     def _prior_moments(self) -> NDArray[np.float64]:
@@ -194,10 +194,20 @@ class MixedEffectsProblem:
             shares[:, first : first + len(self.extras)] = np.transpose(self.priors.extras)
         return shares
 
+    def _prior_mirror(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Prior means of the shape ``(n_terms,)`` and the effects of actuators ``(n_effects, n_act)``."""
+        shape, effects = np.zeros(self.shape.n_terms), np.zeros((N_ACTUATOR_EFFECTS, self.model.n_act))
+        earlier = self.priors.actuators
+        if earlier is not None:
+            shape[: earlier.shape.size] = earlier.shape
+            effects[:] = earlier.gain, earlier.width, *earlier.position
+        return shape, effects
+
     def offset(self, state: MixedEffectsState) -> NDArray[np.float64]:
         """Distance of a state from the prior means, in the order of the unknowns."""
-        common = [*np.zeros(6), state.width - self.priors.mean_width, *state.shape]
-        effects = state.sampling, state.trend, state.actuator.ravel(), state.slope_gain
+        shape, actuator = state.shape - self._mean_shape, state.actuator - self._mean_actuator
+        common = [*np.zeros(6), state.width - self.priors.mean_width, *shape]
+        effects = state.sampling, state.trend, actuator.ravel(), state.slope_gain
         return np.concatenate([common, state.variant - self._mean_variant, *effects])
 
     @property

@@ -1,8 +1,8 @@
 """Priors and normal equations of the mixed-effects fit.
 
 SPRINT fits the differences between the real system and the synthetic model as random effects beside the
-registration. Each effect has a prior of zero mean, with its scatter among instruments of a kind, so that the
-data decide its size and the errors of the registration include it.
+registration. Each effect has a prior, of zero mean but after an earlier fit, with its scatter among
+instruments of a kind, so that the data decide its size and the errors of the registration include it.
 """
 
 from __future__ import annotations
@@ -13,6 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import lu_factor, lu_solve
+
+from escape_hw.api.results import ActuatorCorrections
 
 #: Slopes whose products with all common parameters are in memory at once.
 _SLOPES_AT_ONCE = 256
@@ -43,6 +45,9 @@ class Priors:
         :class:`~.influence_shape.InfluenceShape`.
     mean_width
         Prior mean of the relative width beyond nominal: zero, or the value of an earlier fit.
+    actuators
+        Corrections of an earlier fit: prior means of the shape and of the effects of single actuators, which
+        are zero without it.
     extras
         Prior mean and scatter of each extra parameter, in units of its default scatter; zero and one where
         none are given.
@@ -60,6 +65,7 @@ class Priors:
     shape_scale: float = 1.0
     sampling: float = 0.5
     mean_width: float = 0.0
+    actuators: ActuatorCorrections | None = None
     extras: tuple[tuple[float, float], ...] = ()
     noise_inflation: float = 1.0
 

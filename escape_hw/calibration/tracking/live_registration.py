@@ -140,9 +140,18 @@ class LiveRegistration:
         scatter = min(Priors().width, max(start.width.sigma, _MIN_WIDTH_SIGMA))
         self._extras = build_fitted_extra_parameters(model, start.extras)
         extras = priors_from_fit(self._extras, start.extras)
-        self._priors = Priors(width=scatter, mean_width=start.width.value - 1, extras=extras)
-        # Small pokes hardly determine single actuators, so the corrections of the calibration are kept.
+        # Small pokes hardly determine shape and single actuators: those of the calibration are the prior
+        # means, and what it does not know of the mirror is unknown to all updates.
         self._actuator_corrections = start.actuator_corrections
+        self._priors = Priors(
+            width=scatter, mean_width=start.width.value - 1, actuators=start.actuator_corrections,
+            extras=extras,
+        )  # fmt: skip
+        self._constant_covariance = numbering_covariance(model)
+        if start.actuator_corrections is not None:
+            between_runs = start.repeatability_covariance
+            unknown = start.covariance - (0.0 if between_runs is None else between_runs)
+            self._constant_covariance = self._constant_covariance + _without_negative_variances(unknown)
         self._influence_profile = start.influence_profile
         self._order, self._lags, self._response = order, lags, response
         self._basis = gain_curve_basis(template.n_modes, n_curve_coefficients)
@@ -279,7 +288,7 @@ class LiveRegistration:
         sigma = np.sqrt(np.diag(np.linalg.inv(system.information())))
         estimate = RegistrationEstimate(
             Registration.from_array(present.value[1:6]),
-            present.covariance[1:6, 1:6] + numbering_covariance(self._model),
+            present.covariance[1:6, 1:6] + self._constant_covariance,
             Estimate(float(gain), gain_sigma),
             Estimate(1 + state.width, float(sigma[WIDTH])),
             True,
@@ -313,8 +322,7 @@ class LiveRegistration:
         total_covariance = total_covariance[np.ix_(selected, selected)]
         noise = system.noise_covariance(problem.precision)[np.ix_(selected, selected)]
         total_covariance[np.arange(1, 6), np.arange(1, 6)] += np.square(systematic_error(self._model))
-        eigenvalues, directions = np.linalg.eigh(total_covariance - noise)
-        static = (directions * np.maximum(eigenvalues, 0.0)) @ directions.T
+        static = _without_negative_variances(total_covariance - noise)
         values = np.concatenate([[state.gain], state.alpha, state.variant[first_curve:]])
         return self._drift_line.update(values, noise, static)
 
@@ -327,6 +335,12 @@ class LiveRegistration:
         covariance[GAIN, GAIN] += timing_sigma**2
         variance = np.einsum("pm,pq,qm->m", jacobian, covariance, jacobian)
         return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
+
+
+def _without_negative_variances(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+    """A difference of covariances ``(n, n)`` without the directions in which it is negative."""
+    eigenvalues, directions = np.linalg.eigh(matrix)
+    return np.asarray((directions * np.maximum(eigenvalues, 0.0)) @ directions.T)
 
 
 def _first_curve_index(problem: MixedEffectsProblem) -> int:
