@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from small_bench import assert_flat, small
+from small_bench import assert_flat, dead, small
 from small_system import configuration
 
 from escape_hw.api.registration import PARAMETERS, Registration
@@ -53,6 +53,17 @@ def followed(bench, start, seconds, *, at=None, do=None, **options):
 
 def kinds(found):
     return {alarm.kind for alarm in found.alarms}
+
+
+@pytest.mark.slow
+def test_an_actuator_that_the_calibration_found_dead_is_no_alarm():
+    with small(QUIET) as bench:
+        dead(bench, 18)
+        start = bench.calibrate(frames=600)
+        assert start.registration.actuator_corrections.gain[18] < -0.5
+        found = followed(bench, start, 6)
+    assert found.stable
+    assert "actuator" not in kinds(found)
 
 
 def test_a_drift_is_followed_and_exchanged_without_a_transient(start, monkeypatch):

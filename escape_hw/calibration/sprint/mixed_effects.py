@@ -210,6 +210,10 @@ class MixedEffectsProblem:
         effects = state.sampling, state.trend, actuator.ravel(), state.slope_gain
         return np.concatenate([common, state.variant - self._mean_variant, *effects])
 
+    def actuator_gain_changes(self, state: MixedEffectsState) -> NDArray[np.float64]:
+        """Relative gain of every actuator at a state less its prior mean ``(n_act,)``."""
+        return np.asarray(state.actuator_gain - self._mean_actuator[0])
+
     @property
     def first_variant(self) -> int:
         """Index of the first variant among the unknowns."""

@@ -18,7 +18,7 @@ INNOVATION_LIMIT = 8.0
 #: Misfit and noise of an update, relative to their medians, above which the model does not fit or the slopes
 #: are too noisy.
 MISFIT_FACTOR, NOISE_FACTOR = 2.5, 2.0
-#: Relative gain of an actuator, beyond the common one, that raises an alarm.
+#: Change of the relative gain of an actuator since the calibration that raises an alarm.
 ACTUATOR_GAIN_LIMIT = 0.5
 #: Updates after an alarm without an exchange, and in which an alarm of the same kind is not repeated.
 QUIET_UPDATES = 5
@@ -88,10 +88,11 @@ class AlarmMonitor:
                 f"{self._response.delay_frames:.2f}; check exposure, frame rate, and the latency of "
                 "the computer"
             )
-        worst = int(np.argmax(np.abs(live.actuator_gains)))
-        if abs(live.actuator_gains[worst]) > ACTUATOR_GAIN_LIMIT:
+        changes = live.actuator_gain_changes
+        worst = int(np.argmax(np.abs(changes)))
+        if abs(changes[worst]) > ACTUATOR_GAIN_LIMIT:
             new_alarms["actuator"] = (
-                f"actuator {worst} has {1 + live.actuator_gains[worst]:.0%} of the gain of the others; "
+                f"actuator {worst} has changed its gain by {changes[worst]:+.0%} of that of the others; "
                 "check it, and disable it (devices.dm.limits.disabled) if it is dead"
             )
         moved = float(np.abs(live.registration.registration.to_array() - self._start)[:2].max())

@@ -76,8 +76,8 @@ class LiveEstimate:
         them.
     noise
         Rms of a whitened slope in this block, without the contribution of the commands.
-    actuator_gains
-        Relative gain of every actuator beyond the common one ``(n_act,)``.
+    actuator_gain_changes
+        Change of the relative gain of every actuator since the calibration ``(n_act,)``.
     matrix
         The fitted matrix, random effects included ``(n_slopes, n_modes)``.
     """
@@ -89,7 +89,7 @@ class LiveEstimate:
     innovation: float
     misfit: float
     noise: float
-    actuator_gains: NDArray[np.float64]
+    actuator_gain_changes: NDArray[np.float64]
     matrix: NDArray[np.float64]
     response: TemporalResponse
 
@@ -307,8 +307,8 @@ class LiveRegistration:
         return LiveEstimate(
             estimate, present.random_covariance[1:6, 1:6], gains, self._gains_sigma(present, timing_sigma),
             float(np.abs(present.innovation).max()), float(np.mean(np.square(residual))),
-            float(np.sqrt(block_sums.variance.mean())), state.actuator_gain.copy(), self._current_matrix,
-            response,
+            float(np.sqrt(block_sums.variance.mean())), problem.actuator_gain_changes(state),
+            self._current_matrix, response,
         )  # fmt: skip
 
     def _extrapolate_to_now(
