@@ -18,8 +18,9 @@ INNOVATION_LIMIT = 8.0
 #: Misfit and noise of an update, relative to their medians, above which the model does not fit or the slopes
 #: are too noisy.
 MISFIT_FACTOR, NOISE_FACTOR = 2.5, 2.0
-#: Change of the relative gain of an actuator since the calibration that raises an alarm.
-ACTUATOR_GAIN_LIMIT = 0.5
+#: Relative gain of an actuator, beyond the common one, that raises an alarm, and least change of it since
+#: the calibration, which names weak actuators itself.
+ACTUATOR_GAIN_LIMIT, ACTUATOR_CHANGE_LIMIT = 0.5, 0.2
 #: Updates after an alarm without an exchange, and in which an alarm of the same kind is not repeated.
 QUIET_UPDATES = 5
 #: Updates of the running medians.
@@ -88,11 +89,12 @@ class AlarmMonitor:
                 f"{self._response.delay_frames:.2f}; check exposure, frame rate, and the latency of "
                 "the computer"
             )
-        changes = live.actuator_gain_changes
-        worst = int(np.argmax(np.abs(changes)))
-        if abs(changes[worst]) > ACTUATOR_GAIN_LIMIT:
+        changed = np.abs(live.actuator_gain_changes) > ACTUATOR_CHANGE_LIMIT
+        gains = np.where(changed, live.actuator_gains, 0.0)
+        worst = int(np.argmax(np.abs(gains)))
+        if abs(gains[worst]) > ACTUATOR_GAIN_LIMIT:
             new_alarms["actuator"] = (
-                f"actuator {worst} has changed its gain by {changes[worst]:+.0%} of that of the others; "
+                f"actuator {worst} has {1 + gains[worst]:.0%} of the gain of the others; "
                 "check it, and disable it (devices.dm.limits.disabled) if it is dead"
             )
         moved = float(np.abs(live.registration.registration.to_array() - self._start)[:2].max())

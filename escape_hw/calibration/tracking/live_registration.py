@@ -76,8 +76,9 @@ class LiveEstimate:
         them.
     noise
         Rms of a whitened slope in this block, without the contribution of the commands.
-    actuator_gain_changes
-        Change of the relative gain of every actuator since the calibration ``(n_act,)``.
+    actuator_gains, actuator_gain_changes
+        Relative gain of every actuator beyond the common one, and its change since the calibration
+        ``(n_act,)``.
     matrix
         The fitted matrix, random effects included ``(n_slopes, n_modes)``.
     """
@@ -89,6 +90,7 @@ class LiveEstimate:
     innovation: float
     misfit: float
     noise: float
+    actuator_gains: NDArray[np.float64]
     actuator_gain_changes: NDArray[np.float64]
     matrix: NDArray[np.float64]
     response: TemporalResponse
@@ -196,14 +198,14 @@ class LiveRegistration:
             # The residual for the matrix in use includes its error: fit once for the noise.
             self._add_block(block, delayed)
             problem, system, self._state = self._gauss_newton()
-            self._priors = problem.estimate_priors(self._state, system).priors
+            self._priors = _estimate_priors(problem, self._state, system)
             self._current_matrix, self._sums = self._matrix, ForgettingSums.zeros(*self._template.data.shape)
         block_sums = self._add_block(block, delayed)
         problem, system, self._state = self._gauss_newton()
         self._updates += 1
         found = self._build_estimate(problem, system, self._state, block_sums, response)
         if learning:
-            self._priors = problem.estimate_priors(self._state, system).priors
+            self._priors = _estimate_priors(problem, self._state, system)
         return found
 
     def _add_block(self, block: FilteredTelemetry, delayed: NDArray[np.float32]) -> ForgettingSums:
@@ -307,8 +309,8 @@ class LiveRegistration:
         return LiveEstimate(
             estimate, present.random_covariance[1:6, 1:6], gains, self._gains_sigma(present, timing_sigma),
             float(np.abs(present.innovation).max()), float(np.mean(np.square(residual))),
-            float(np.sqrt(block_sums.variance.mean())), problem.actuator_gain_changes(state),
-            self._current_matrix, response,
+            float(np.sqrt(block_sums.variance.mean())), state.actuator_gain.copy(),
+            problem.actuator_gain_changes(state), self._current_matrix, response,
         )  # fmt: skip
 
     def _extrapolate_to_now(
@@ -335,6 +337,14 @@ class LiveRegistration:
         covariance[GAIN, GAIN] += timing_sigma**2
         variance = np.einsum("pm,pq,qm->m", jacobian, covariance, jacobian)
         return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
+
+
+def _estimate_priors(
+    problem: MixedEffectsProblem, state: MixedEffectsState, system: NormalEquations
+) -> Priors:
+    """Scatter of the effects; that of the gains of actuators at least as usual, since any may fail."""
+    priors = problem.estimate_priors(state, system).priors
+    return replace(priors, actuator_gain=max(priors.actuator_gain, Priors().actuator_gain))
 
 
 def _without_negative_variances(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
