@@ -102,7 +102,8 @@ def test_no_procedure_can_be_started_and_the_reason_is_shown(empty, folder):
         assert not button.isEnabled()
         assert "replay of a recorded run" in button.toolTip()
     assert "recorded run" in procedure._description.text()
-    assert procedure.outcome.text() == "Done: A run"
+    # The state of the run may come with a later refresh than its source.
+    until(lambda: procedure.outcome.text() == "Done: A run", empty)
 
 
 def test_the_slider_moves_through_the_run(empty, folder):

@@ -39,6 +39,7 @@ from escape_hw.runtime.procedures.matrix_input import load_fitting_matrix
         ("streams", "--seconds", 1e80),
         ("emulate", "e727", "--seconds", 1e80),
         ("modulator", "start", "razor-pywfs", "--seconds", 1e80),
+        ("export", "milk", "absent.npy", ""),
         ("discover", "--host", ""),
         ("discover", "--host", "host:port"),
         ("discover", "--host", "host:99999"),

@@ -55,6 +55,15 @@ def test_an_interrupted_run_is_not_finished(description: SweepDescription, tmp_p
     assert find_finished_result(tmp_path / "run", description) is None
 
 
+@pytest.mark.parametrize(
+    "words", [("--trials", 300), ("--gain", "0.1:0.5"), ("--set", "loop.leak=0.02"), ("--force",)]
+)
+def test_options_of_a_new_sweep_are_refused_with_the_one_to_resume(escape, description, tmp_path, words):
+    code, out, err = escape("sweep", "--resume", tmp_path / "run", *words)
+    assert (code, out) == (2, "")
+    assert f"{words[0]}: a sweep that is resumed keeps its own" in err
+
+
 @pytest.mark.parametrize("where", ["run", "elsewhere"])
 @pytest.mark.slow
 def test_resume_of_a_finished_sweep_shows_its_result(

@@ -53,6 +53,8 @@ TRANSIENT_S = 0.1
 #: with the true registration [%].
 SHIFT_LIMIT, STREHL_LIMIT = 2.0, 1.0
 LABELS = {"true": "true registration, no pokes", "first": "first matrix, no pokes"}
+#: Their marks and colours.
+MARKS, COLOURS = "os", (style.INK, style.SERIES[1])
 
 
 def read_comparison(out: Path, loop: str) -> NDArray[np.float64]:
@@ -141,7 +143,11 @@ def band(panel: Any, t: Any, value: Any, sigma: Any) -> None:
 def picture(rows: dict[str, Any], truth: Any, gains: Any, others: dict[str, Any]) -> Figure:
     """Shift and its error, rotation, gain, Strehl ratio and its loss, against time."""
     figure = style.new_figure(9.2, 9.0)
-    panels = figure.subplots(3, 2, sharex=True).ravel()
+    panels = list(figure.subplots(3, 2, sharex=True).ravel())
+    if not others:
+        # Nothing to compare the Strehl ratio with.
+        panels.pop().remove()
+        panels[3].tick_params(labelbottom=True)
     t = rows["seconds"]
     for panel, name, k, title in (
         (panels[0], "shift_x", 0, "shift x [% of a sub-aperture]"),
@@ -159,7 +165,9 @@ def picture(rows: dict[str, Any], truth: Any, gains: Any, others: dict[str, Any]
     band(panels[3], t, rows["optical_gain"], rows["optical_gain_sigma"])
     panels[3].plot(gains[:, 0], gains[:, 1], "o", ms=3, color=style.INK, label="true")
     style.style_axes(panels[3]).set_title("optical gain, relative to the initial matrix", fontsize=9.5)
-    strehl_panels(panels[4], panels[5], rows, others)
+    strehl_panel(panels[4], rows, others)
+    if others:
+        loss_panel(panels[5], rows, others)
     for panel in panels:
         panel.legend(frameon=False, fontsize=8)
     for panel in panels[4:]:
@@ -167,31 +175,30 @@ def picture(rows: dict[str, Any], truth: Any, gains: Any, others: dict[str, Any]
     return figure
 
 
-def strehl_panels(panel: Any, deficit_panel: Any, rows: dict[str, Any], others: dict[str, Any]) -> None:
-    """Strehl ratios, and their loss relative to the loop with the true registration."""
+def strehl_panel(panel: Any, rows: dict[str, Any], others: dict[str, Any]) -> None:
+    """Strehl ratios of all loops."""
     t, ratio = rows["seconds"], np.isfinite(rows["strehl"])
     panel.errorbar(
         t[ratio], 100 * rows["strehl"][ratio], 100 * rows["strehl_sigma"][ratio],
         color=style.SERIES[0], lw=1.0, elinewidth=0.5, label="tracked, with pokes",
     )  # fmt: skip
-    reference = others.get("true")
-    for (loop, comparisons), mark, colour in zip(
-        others.items(), "os", (style.INK, style.SERIES[1]), strict=False
-    ):
+    for (loop, comparisons), mark, colour in zip(others.items(), MARKS, COLOURS, strict=False):
         panel.plot(comparisons[:, 0], 100 * comparisons[:, 1], mark, ms=3.5, color=colour, label=LABELS[loop])
+    style.style_axes(panel).set_title("Strehl ratio, peak [%]", fontsize=9.5)
+
+
+def loss_panel(panel: Any, rows: dict[str, Any], others: dict[str, Any]) -> None:
+    """Strehl ratios relative to the loop with the true registration."""
+    reference = others.get("true")
+    for (loop, comparisons), mark, colour in zip(others.items(), MARKS, COLOURS, strict=False):
         if reference is not None and len(reference) == len(comparisons) and loop != "true":
             deficit = 100 * (comparisons[:, 1] / reference[:, 1] - 1)
-            deficit_panel.plot(comparisons[:, 0], deficit, mark, ms=3.5, color=colour, label=LABELS[loop])
+            panel.plot(comparisons[:, 0], deficit, mark, ms=3.5, color=colour, label=LABELS[loop])
     if reference is not None:
-        deficit = 100 * (at_same_times(reference, t, rows["strehl"]) / reference[:, 1] - 1)
-        deficit_panel.plot(
-            reference[:, 0], deficit, "-", color=style.SERIES[0], lw=1.2, label="tracked, with pokes"
-        )
-    deficit_panel.axhline(-STREHL_LIMIT, color=style.MUTED, lw=1.0, ls=":", label="limit")
-    style.style_axes(panel).set_title("Strehl ratio, peak [%]", fontsize=9.5)
-    style.style_axes(deficit_panel).set_title(
-        "Strehl ratio relative to the loop with the true registration [%]", fontsize=9.5
-    )
+        deficit = 100 * (at_same_times(reference, rows["seconds"], rows["strehl"]) / reference[:, 1] - 1)
+        panel.plot(reference[:, 0], deficit, "-", color=style.SERIES[0], lw=1.2, label="tracked, with pokes")
+    panel.axhline(-STREHL_LIMIT, color=style.MUTED, lw=1.0, ls=":", label="limit")
+    style.style_axes(panel).set_title("Strehl ratio relative to true registration [%]", fontsize=9.5)
 
 
 #: Seconds of an interval of the other loops, and seconds for which they are closed before it.

@@ -36,6 +36,9 @@ _THIN_PLATE = (
     "twin.mirror.coupling=0.41", "twin.mirror.wing_fraction=0", "twin.mirror.gain_scatter=0.05",
 )  # fmt: skip
 
+#: Sensors that are not built like the model.
+OOPAO = ("system.optics=oopao",)
+
 
 @dataclass(frozen=True)
 class Case:
@@ -58,6 +61,12 @@ CASES = {
     "gaussian-50": Case("Gaussian influence functions, 50 frames", "razor-shwfs", 50, GAUSSIAN),
     "thin-plate-1000": Case("thin plates, 1,000 frames", "razor-shwfs", 1000, _THIN_PLATE),
     "dm97-1500": Case("mirrors like a DM97, 1,500 frames", "razor-pywfs", 1500, dm97=True),
+    "oopao-1000": Case(
+        "mirrors like a DM97, optics of OOPAO, 1,000 frames", "razor-shwfs", 1000, OOPAO, dm97=True
+    ),
+    "oopao-1500": Case(
+        "mirrors like a DM97, optics of OOPAO, 1,500 frames", "razor-pywfs", 1500, OOPAO, dm97=True
+    ),
     "revolt-2000": Case("as bundled, 2,000 frames", "revolt-shwfs", 2000),
     "nir-1500": Case("as bundled, 1,500 frames", "maps-nir", 1500),
     "nir-clean-1500": Case(

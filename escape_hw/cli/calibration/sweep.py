@@ -9,7 +9,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import click
 import typer
+from click.core import ParameterSource
 
 from escape_hw.cli import options
 from escape_hw.cli.command import command
@@ -28,6 +30,10 @@ if TYPE_CHECKING:
     from escape_hw.runtime.sweep.result import SweepResult
     from escape_hw.runtime.sweep.search_space import Parameter
     from escape_hw.runtime.sweep.workers import Workers
+
+
+#: Options that a sweep to resume may have beside its folder; all others describe a new one.
+_RESUMABLE = {"resume", "workers", "scheduler", "storage", "out", "json", "quiet"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,6 +135,7 @@ def sweep(
 
     given: SweepDescription | _Request
     if resume is not None:
+        _refuse_new_options()
         given = read_description(resume, storage)
         config = context.load_config(selection := replace(selection, system=str(resume / "config.toml")))
         if _show_finished(context, resume, given):
@@ -150,6 +157,20 @@ def sweep(
         closing(open_workers(workers, scheduler)) if config.simulated else nullcontext() as pool,
     ):
         _run(context, selection, given, folder, pool)
+
+
+def _refuse_new_options() -> None:
+    """Raise if the command line describes a new sweep beside the one to resume."""
+    context = click.get_current_context()
+    given = [
+        f"--{name.replace('_', '-')}"
+        for name in context.params
+        if context.get_parameter_source(name) is ParameterSource.COMMANDLINE and name not in _RESUMABLE
+    ]
+    if given:
+        raise ConfigError(
+            f"{', '.join(given)}: a sweep that is resumed keeps its own; leave it out, or start a new sweep"
+        )
 
 
 def _read_request(

@@ -113,6 +113,8 @@ def export_milk(
     from escape_hw.io.interchange.milk.matrix import calibration_images
     from escape_hw.io.interchange.pyrtc.files import read_file
 
+    if not name:
+        raise ConfigError("NAME is empty: give the images a name, for example 'escape'")
     if file.suffix == ".npy":
         _publish(name, read_file(file).data, version)
         context.show(f"{name}: {shm_path(name)}")
