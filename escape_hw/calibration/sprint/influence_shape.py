@@ -26,10 +26,11 @@ _N_LOBES = 8
 #: a third of them.
 _PROFILE_SIGMA, _FOURFOLD_SIGMA = 0.3, 0.05
 _EDGE_GAIN_SIGMA, _EDGE_WIDTH_SIGMA, _EDGE_PROFILE_SIGMA, _EDGE_ASYMMETRY_SIGMA = 0.2, 0.1, 0.1, 0.1
-#: Changes of registration, in its units, and width below which the four-fold terms, a few per cent of the
-#: matrix, are kept; and derivatives of terms that may be larger on a mirror of another family.
-_KEEP_WITHIN = np.array([5.0, 5.0, 0.1, 0.2, 0.2, 0.01])
-KEEP_DERIVATIVES_WITHIN = _KEEP_WITHIN / 10
+#: Changes of registration, in its units, and width below which terms of a few per cent of the matrix are
+#: kept, the four-fold ones and those that follow a mirror; and derivatives of terms that may be larger on a
+#: mirror of another family.
+KEEP_WITHIN = np.array([5.0, 5.0, 0.1, 0.2, 0.2, 0.01])
+KEEP_DERIVATIVES_WITHIN = KEEP_WITHIN / 10
 #: Half step of derivatives by position, in % of a sub-aperture.
 _SHIFT_STEP = 2.0
 #: Actuators closer than this many pitches are neighbours.
@@ -237,7 +238,7 @@ class InfluenceShape:
     def _fourfold_terms(self, registration: Registration, width: float) -> list[NDArray[np.float64]]:
         """Lobes along the axes of the mirror less those between them; their derivatives are neglected."""
         at = np.append(registration.to_array(), width)
-        if self._fourfold_at is not None and (np.abs(at - self._fourfold_at) < _KEEP_WITHIN).all():
+        if self._fourfold_at is not None and (np.abs(at - self._fourfold_at) < KEEP_WITHIN).all():
             return self._fourfold
         affine, _ = registration.affine(self._model.sub_aperture_m)
         terms = []

@@ -19,7 +19,11 @@ from escape_hw.api.synthetic_model import HasGainTrend, SyntheticModel
 from escape_hw.calibration.modes.derivatives import modal_matrix, zonal_jacobian
 from escape_hw.calibration.sprint.covariance import LinearisedProblem
 from escape_hw.calibration.sprint.extra_parameters import ExtraParameterModel, FittedExtraParameter
-from escape_hw.calibration.sprint.influence_shape import KEEP_DERIVATIVES_WITHIN, InfluenceShape
+from escape_hw.calibration.sprint.influence_shape import (
+    KEEP_DERIVATIVES_WITHIN,
+    KEEP_WITHIN,
+    InfluenceShape,
+)
 from escape_hw.calibration.sprint.normal_equations import NormalEquations, Priors, normal_equations
 from escape_hw.calibration.sprint.weighted_matrix import WeightedMatrix
 from escape_hw.pipeline.statistics import root_mean_square
@@ -43,6 +47,9 @@ _MIN_PRIOR_RATIO, _MAX_PRIOR_RATIO = 0.05, 3.0
 #: Relative change of the fitted matrix below which derivatives are kept: they change by about as much. With
 #: five times as much, solutions for matrices of high signal-to-noise ratio differ by their stated errors.
 _KEEP_BELOW = 0.002
+#: The same for a mirror that is followed, whose registration and width stay within :data:`KEEP_WITHIN`: the
+#: change is that of shares and effects, in which the matrix is linear.
+_FOLLOW_BELOW = 0.05
 #: The same at a solution, where the stated errors follow from the derivatives.
 _SAME_BELOW = 1e-4
 #: Iterations of the empirical-Bayes fixed point, and relative change of all scatters that ends them.
@@ -89,6 +96,13 @@ class _ZonalMatrices:
     terms: list[NDArray[np.float64]]
     variants: list[NDArray[np.float64]]
     total: NDArray[np.float64]
+    #: Registration and width.
+    at: NDArray[np.float64]
+
+
+def _position(state: MixedEffectsState) -> NDArray[np.float64]:
+    """Registration and relative width of a state ``(6,)``."""
+    return np.append(state.alpha, 1.0 + state.width)
 
 
 class VariantDerivatives:
@@ -132,6 +146,9 @@ class MixedEffectsProblem:
         derivatives at its solution if the matrix is the same, too.
     usual_priors
         Scatter that the limits of the estimated one are relative to.
+    follow
+        Whether the zonal derivatives of ``earlier``, which may have another matrix, are used as long as the
+        zonal matrix hardly changes: for a mirror that moves slowly.
     """
 
     def __init__(
@@ -143,6 +160,7 @@ class MixedEffectsProblem:
         extras: Sequence[ExtraParameterModel] = (),
         earlier: MixedEffectsProblem | None = None,
         usual_priors: Priors | None = None,
+        follow: bool = False,
     ) -> None:
         self.weighted, self.command_curves, self.priors = weighted, tuple(command_curves), priors
         self.extras, self._usual_priors = tuple(extras), usual_priors or Priors()
@@ -158,6 +176,8 @@ class MixedEffectsProblem:
         self.kept: tuple[_ZonalMatrices, NormalEquations] | None = None
         if earlier and earlier.weighted is weighted:
             self.kept = earlier.kept
+        self._follow = follow
+        self.near: _ZonalMatrices | None = earlier.near if earlier and follow else None
         self.variant_derivatives: VariantDerivatives = (
             earlier.variant_derivatives if earlier else VariantDerivatives(model, self.variants)
         )
@@ -250,8 +270,19 @@ class MixedEffectsProblem:
         for extra, share in zip(self.extras, state.variant[first:], strict=False):
             variants.append(extra.matrix_change(profile_matrix, registration, float(share)))
         variants += [shaped.nominal @ command_curve for command_curve in self.command_curves]
-        z = _ZonalMatrices(jacobian, jacobian[5] * w, shaped.terms, variants, shaped.matrix)
+        z = _ZonalMatrices(jacobian, jacobian[5] * w, shaped.terms, variants, shaped.matrix, _position(state))
         z.total = self._add_effects(shaped.matrix, state, z)
+        return z
+
+    def _matrices_nearby(self, state: MixedEffectsState) -> _ZonalMatrices:
+        """The zonal matrix of a state and its parts, with derivatives from near it if they are to be kept."""
+        if self.near is not None and (np.abs(_position(state) - self.near.at) < KEEP_WITHIN).all():
+            total = self._extrapolate_zonal(state, self.near)
+            if np.linalg.norm(total - self.near.total) < _FOLLOW_BELOW * np.linalg.norm(total):
+                return replace(self.near, total=total)
+        z = self._zonal_matrices(state)
+        if self._follow:
+            self.near = z
         return z
 
     @staticmethod
@@ -280,13 +311,13 @@ class MixedEffectsProblem:
 
     def matrix(self, state: MixedEffectsState, m2c: NDArray[np.float64]) -> NDArray[np.float64]:
         """Slopes per unit of modes ``m2c (n_act, n)`` at a state, random effects included."""
-        return self.zonal_matrix(state) @ m2c
+        return self._with_gains(state, self._matrices_nearby(state)) @ m2c
 
     def linearise(self, state: MixedEffectsState) -> NormalEquations:
         """Model and derivatives about a state."""
         if self.kept is not None and (system := self._update_kept(state, *self.kept)):
             return system
-        z = self._zonal_matrices(state)
+        z = self._matrices_nearby(state)
         actuator_factor = 1 + state.actuator_gain
         # The weights of the slopes are applied together with their gains.
         scale = (state.gain * self._slope_gains(state) / self.weighted.by_slope)[:, None]
@@ -316,13 +347,17 @@ class MixedEffectsProblem:
             change = np.linalg.norm(system.residual - residual)
             if change < _SAME_BELOW * np.linalg.norm(self.weighted.data - residual):
                 return system
-            self.kept = None
+            self.kept = self.near = None
         return self.linearise(state)
+
+    def _extrapolate_zonal(self, state: MixedEffectsState, z: _ZonalMatrices) -> NDArray[np.float64]:
+        """The zonal matrix of a state, with derivatives from near it ``(n_slopes, n_act)``."""
+        registration, w = Registration.from_array(state.alpha), 1.0 + state.width
+        return self._add_effects(self.shape.matrix(registration, w, state.shape, z.terms), state, z)
 
     def _extrapolate(self, state: MixedEffectsState, z: _ZonalMatrices) -> NDArray[np.float64]:
         """The weighted matrix of a state, with derivatives from near it ``(n_slopes, n_modes)``."""
-        registration, w = Registration.from_array(state.alpha), 1.0 + state.width
-        total = self._add_effects(self.shape.matrix(registration, w, state.shape, z.terms), state, z)
+        total = self._extrapolate_zonal(state, z)
         scale = (state.gain * self._slope_gains(state) / self.weighted.by_slope)[:, None]
         modes = (1 + state.actuator_gain)[:, None] * self.modes
         return np.asarray(scale * (self._sampled(state, total, z) @ modes))
@@ -358,7 +393,10 @@ class MixedEffectsProblem:
 
     def zonal_matrix(self, state: MixedEffectsState) -> NDArray[np.float64]:
         """Slopes per unit command ``(n_slopes, n_act)`` at a state, random effects included."""
-        z = self._zonal_matrices(state)
+        return self._with_gains(state, self._zonal_matrices(state))
+
+    def _with_gains(self, state: MixedEffectsState, z: _ZonalMatrices) -> NDArray[np.float64]:
+        """The zonal matrix of a state from its parts, with sampling positions and gains."""
         scale = state.gain * self._slope_gains(state)
         return np.asarray(scale[:, None] * self._sampled(state, z.total, z) * (1 + state.actuator_gain))
 

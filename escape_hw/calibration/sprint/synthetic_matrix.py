@@ -5,7 +5,7 @@ It contains the fitted corrections of the actuators and has propagated standard 
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,37 @@ from escape_hw.calibration.acquisition.frames import build_interaction_matrix
 from escape_hw.calibration.modes.derivatives import modal_matrix, zonal_jacobian
 from escape_hw.calibration.sprint.extra_parameters import build_fitted_extra_parameters
 from escape_hw.calibration.sprint.influence_shape import InfluenceShape
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FittedMatrix:
+    """Matrix of the fitted mirror at unit gain.
+
+    Parameters
+    ----------
+    unit
+        The matrix ``(n_slopes, n_modes)``.
+    derivatives
+        By the five parameters of the registration and by the width ``(6, n_slopes, n_modes)``.
+    variance
+        Of the matrix, from the errors of the actuator gains ``(n_slopes, n_modes)``; 0 without corrections of
+        the actuators.
+    """
+
+    unit: NDArray[np.float64]
+    derivatives: NDArray[np.float64]
+    variance: NDArray[np.float64]
+
+    def with_errors(self, estimate: RegistrationEstimate) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Matrix at the gain of an estimate, and its standard errors ``(n_slopes, n_modes)``.
+
+        The errors are those of registration, gain and actuator gains, propagated to first order.
+        """
+        gain = estimate.gain.value
+        jacobian = gain * self.derivatives[:5]
+        variance = np.einsum("psm,pq,qsm->sm", jacobian, estimate.covariance, jacobian, optimize=True)
+        variance += np.square(self.unit * estimate.gain.sigma) + gain**2 * self.variance
+        return gain * self.unit, np.sqrt(np.maximum(variance, 0))
 
 
 def compute_fitted_matrix(
@@ -45,30 +76,27 @@ def compute_fitted_matrix(
     """
     if estimate.actuator_corrections is None and not estimate.extras:
         return modal_matrix(model, registration, m2c, estimate.width.value)
-    return compute_fitted_jacobian(model, replace(estimate, registration=registration), m2c)[0]
+    return compute_fitted_jacobian(model, replace(estimate, registration=registration), m2c).unit
 
 
 def compute_fitted_jacobian(
-    model: SyntheticModel, estimate: RegistrationEstimate, m2c: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    model: SyntheticModel,
+    estimate: RegistrationEstimate,
+    m2c: NDArray[np.float64],
+    shape: InfluenceShape | None = None,
+) -> FittedMatrix:
     """Matrix of the fitted mirror, its derivatives, and its variance due to the actuators.
 
     Parameters
     ----------
     model, estimate, m2c
         As for :func:`compute_fitted_matrix`.
-
-    Returns
-    -------
-    matrix : ndarray, ``(n_slopes, n_modes)``
-    derivatives : ndarray, ``(6, n_slopes, n_modes)``
-        By the five parameters of the registration and by the width.
-    variance : ndarray, ``(n_slopes, n_modes)``
-        Of the matrix, from the errors of the actuator gains; 0 without actuator corrections.
+    shape
+        The shape of the model's influence functions, of which terms at nearby registrations are used.
     """
     registration, width = estimate.registration, estimate.width.value
     corrections = estimate.actuator_corrections
-    scaled_modes, variance, shape = m2c, 0.0, InfluenceShape(model)
+    scaled_modes, variance, shape = m2c, 0.0, shape or InfluenceShape(model)
     coefficients = np.zeros(shape.n_terms)
     if corrections is None:
         single, jacobian = zonal_jacobian(model, registration, width)
@@ -88,7 +116,7 @@ def compute_fitted_jacobian(
         scaled_value = estimate.extras[one.name].value / one.prior_sigma
         single = single + scaled_value * one.matrix_change(profile_matrix, registration, scaled_value)
     unit = single @ scaled_modes
-    return unit, jacobian @ scaled_modes, np.broadcast_to(variance, unit.shape)
+    return FittedMatrix(unit, jacobian @ scaled_modes, np.broadcast_to(variance, unit.shape))
 
 
 def compute_pseudo_synthetic_matrix(
@@ -99,21 +127,24 @@ def compute_pseudo_synthetic_matrix(
     Returns
     -------
     matrix, sigma : ndarray, ``(n_slopes, n_modes)``
-        The errors are those of registration, gain and actuator gains, propagated to first order.
+        As of :meth:`FittedMatrix.with_errors`.
     """
-    gain = estimate.gain.value
-    unit, derivatives, actuator_variance = compute_fitted_jacobian(model, estimate, m2c)
-    jacobian = gain * derivatives[:5]
-    variance = np.einsum("psm,pq,qsm->sm", jacobian, estimate.covariance, jacobian, optimize=True)
-    variance += np.square(unit * estimate.gain.sigma) + gain**2 * actuator_variance
-    return gain * unit, np.sqrt(np.maximum(variance, 0))
+    return compute_fitted_jacobian(model, estimate, m2c).with_errors(estimate)
 
 
 def synthesise_calibration(
-    bench: Bench, grid: SensorGeometry, estimate: RegistrationEstimate, m2c: NDArray[np.float64]
+    bench: Bench,
+    grid: SensorGeometry,
+    estimate: RegistrationEstimate,
+    m2c: NDArray[np.float64],
+    fitted: FittedMatrix | None = None,
 ) -> CalibrationResult:
-    """Calibration with the pseudo-synthetic matrix of an estimate for modes ``m2c``; moves no device."""
-    data, sigma = compute_pseudo_synthetic_matrix(bench.model(grid), estimate, m2c)
+    """Calibration with the pseudo-synthetic matrix of an estimate for modes ``m2c``; moves no device.
+
+    ``fitted``: the matrix of the fitted mirror, if it is known.
+    """
+    fitted = fitted or compute_fitted_jacobian(bench.model(grid), estimate, m2c)
+    data, sigma = fitted.with_errors(estimate)
     matrix = build_interaction_matrix(bench, grid, m2c, data, sigma, "escape", gain=estimate.gain.value)
     return CalibrationResult(matrix, grid, 0, 0, 0.0, registration=estimate)
 

@@ -10,10 +10,8 @@ from numpy.typing import NDArray
 from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.registration import PARAMETERS
 from escape_hw.api.results import Estimate, RegistrationEstimate
-from escape_hw.api.synthetic_model import SyntheticModel
 from escape_hw.api.tracking import Exchange
 from escape_hw.calibration.loop.control import invert_matrix
-from escape_hw.calibration.sprint.synthetic_matrix import compute_pseudo_synthetic_matrix
 from escape_hw.calibration.tracking.live_registration import LiveEstimate, scale_to_live_gains
 
 #: Change of the matrix, in standard errors, above which it is significant.
@@ -42,7 +40,6 @@ class ExchangeProposal:
 
 def propose_exchange(
     synthetic: InteractionMatrix,
-    model: SyntheticModel,
     live: LiveEstimate,
     in_use: ActiveReconstructor,
     dropped: int,
@@ -51,15 +48,15 @@ def propose_exchange(
 ) -> ExchangeProposal:
     """Compare the matrix at the live registration with the one in use.
 
-    ``synthetic``, ``model``: pseudo-synthetic matrix at the live registration and the live common gain, and
-    its model; ``exchange_threshold``: relative change of the matrix above which an exchange is proposed.
+    ``synthetic``: pseudo-synthetic matrix at the live registration and the live common gain;
+    ``exchange_threshold``: relative change of the matrix above which an exchange is proposed.
     """
     new = scale_to_live_gains(synthetic, live)
     scale = float(np.linalg.norm(new.data))
     mismatch = float(np.linalg.norm(new.data - in_use.matrix.data)) / scale
     live_gain = Estimate(live.registration.gain.value, float(live.gains_sigma.mean()))
     drift_only = replace(live.registration, covariance=live.change_covariance, gain=live_gain)
-    errors = compute_pseudo_synthetic_matrix(model, drift_only, synthetic.m2c)[1]
+    errors = live.fitted.with_errors(drift_only)[1]
     sigma = float(np.linalg.norm(errors)) / scale
     loop = np.linalg.eigvals(in_use.reconstructor.astype(float) @ new.data.astype(float))
     # The loop gain of dropped eigenmodes is 0.

@@ -32,7 +32,7 @@ from escape_hw.calibration.sprint.mixed_effects import (
 )
 from escape_hw.calibration.sprint.normal_equations import NormalEquations, Priors
 from escape_hw.calibration.sprint.numbering import numbering_covariance
-from escape_hw.calibration.sprint.synthetic_matrix import compute_fitted_matrix
+from escape_hw.calibration.sprint.synthetic_matrix import FittedMatrix, compute_fitted_jacobian
 from escape_hw.calibration.sprint.telemetry_fit import fit_whitener
 from escape_hw.calibration.sprint.weighted_matrix import WeightedMatrix, apply_model_weights
 from escape_hw.errors import TooFewFrames
@@ -81,6 +81,8 @@ class LiveEstimate:
         ``(n_act,)``.
     matrix
         The fitted matrix, random effects included ``(n_slopes, n_modes)``.
+    fitted
+        Matrix of the calibration's mirror at this registration.
     """
 
     registration: RegistrationEstimate
@@ -93,6 +95,7 @@ class LiveEstimate:
     actuator_gains: NDArray[np.float64]
     actuator_gain_changes: NDArray[np.float64]
     matrix: NDArray[np.float64]
+    fitted: FittedMatrix
     response: TemporalResponse
 
 
@@ -165,6 +168,7 @@ class LiveRegistration:
         )
         # Fitted matrix at the mean age of the sums, and extrapolated to the present.
         self._matrix = self._current_matrix = template.data.astype(np.float64)
+        self._problem: MixedEffectsProblem | None = None
         self.restart()
 
     def restart(self) -> None:
@@ -252,9 +256,10 @@ class LiveRegistration:
             columns = self._sums.build_columns(self._template, self._matrix)
             weighted = WeightedMatrix.from_columns(columns, np.arange(columns.n_modes))
             weighted = apply_model_weights(weighted, self._model)
-            problem = MixedEffectsProblem(
-                weighted, self._model, self._priors, self._command_curves, self._extras
-            )
+            self._problem = problem = MixedEffectsProblem(
+                weighted, self._model, self._priors, self._command_curves, self._extras, self._problem,
+                follow=True,
+            )  # fmt: skip
             state = state or problem.initial_state(self._start)
             system = problem.linearise(state)
             step = system.solve()
@@ -304,13 +309,14 @@ class LiveRegistration:
             repeatability_covariance=present.random_covariance[1:6, 1:6],
             influence_profile=self._influence_profile,
         )
-        unit = compute_fitted_matrix(self._model, self._start, estimate, self._template.m2c)
+        fitted = compute_fitted_jacobian(self._model, estimate, self._template.m2c, problem.shape)
+        unit = fitted.unit
         gains = np.asarray((self._current_matrix * unit).sum(axis=0) / np.square(unit).sum(axis=0))
         return LiveEstimate(
             estimate, present.random_covariance[1:6, 1:6], gains, self._gains_sigma(present, timing_sigma),
             float(np.abs(present.innovation).max()), float(np.mean(np.square(residual))),
             float(np.sqrt(block_sums.variance.mean())), state.actuator_gain.copy(),
-            problem.actuator_gain_changes(state), self._current_matrix, response,
+            problem.actuator_gain_changes(state), self._current_matrix, fitted, response,
         )  # fmt: skip
 
     def _extrapolate_to_now(

@@ -269,9 +269,11 @@ class _Tracker:
             live = self.live.update(data, start)
         except TooFewFrames:
             return None
-        synthetic = synthesise_calibration(self.bench, self.grid, live.registration, self.in_use.matrix.m2c)
+        synthetic = synthesise_calibration(
+            self.bench, self.grid, live.registration, self.in_use.matrix.m2c, live.fitted
+        )
         proposal = propose_exchange(
-            synthetic.matrix, self.model, live, self.in_use, self.dropped, seconds,
+            synthetic.matrix, live, self.in_use, self.dropped, seconds,
             self.bench.config.tracking.exchange_threshold,
         )  # fmt: skip
         ratio = None if images is None or self.psf is None else peak_strehl(images, self.psf)
