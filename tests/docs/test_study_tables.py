@@ -15,15 +15,15 @@ from escape_hw.runtime.session.system import System
 #: Scripts that only print, if their raw table has all realisations.
 SCRIPTS = (
     "capture_range", "closed_loop_response", "constants", "lenslet_pokes", "neighbouring_spots", "nuisances",
+    "tracked_realisations",
 )  # fmt: skip
 COMMAND = re.compile(
-    rf"^python (benchmarks/studies/(?:registration|turbulence)/(?:{'|'.join(SCRIPTS)})\.py .*--out docs/.*)$",
-    re.MULTILINE,
+    rf"^python (benchmarks/studies/[a-z]+/(?:{'|'.join(SCRIPTS)})\.py .*--out docs/.*)$", re.MULTILINE
 )
 TEXTS = [page.read_text(encoding="utf-8") for page in EVERY]
 QUOTED = [(text, command) for text in TEXTS for command in COMMAND.findall(text)]
 #: First realisation of a study, by the folder of its raw tables.
-FIRST = {"capture": 0, "constants": 1000, "nuisances": 2000}
+FIRST = {"capture": 0, "constants": 10000, "nuisances": 2000}
 
 
 @pytest.mark.parametrize(("text", "command"), QUOTED, ids=[command for _, command in QUOTED])

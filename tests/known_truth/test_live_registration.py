@@ -24,7 +24,7 @@ SHEAR = 1.5
 
 
 def looked(
-    bench, blocks, frames, poke=0.002, gain=None, n_curve_coefficients=0, memory=1e9, start_frames=600,
+    bench, blocks, frames, poke=0.002, gain=None, n_curve_coefficients=0, memory_s=1e9, start_frames=600,
     start=None,
 ):  # fmt: skip
     """Calibrate, close the loop, and look at blocks of its frames; the last look, and the calibration."""
@@ -41,9 +41,8 @@ def looked(
     c = bench.config.calibration
     live = LiveRegistration(
         start.matrix, bench.model(slope_statistics.annotate_geometry(start.grid, closed=True)),
-        start.registration, order=c.whiten_order, lags=c.lags, memory=memory,
+        start.registration, order=c.whiten_order, lags=c.lags, memory_s=memory_s,
         n_curve_coefficients=n_curve_coefficients, response=start.response,
-        step_s=frames / bench.wfs.settings.frame_rate_hz,
     )  # fmt: skip
     history = count_history_rows(c.whiten_order, c.lags)
     buffer = TelemetryBuffer(start.grid.n_slopes, start.matrix.n_modes, frames, history)
@@ -53,7 +52,7 @@ def looked(
                 frames, inject=lambda: amplitude * bench.rng.uniform(-1, 1, amplitude.size), observe=[buffer]
             )
         )
-        found = live.update(*buffer.take_block())
+        found = live.update(*buffer.take_block(), frames / bench.wfs.settings.frame_rate_hz)
     bench.dm.flatten()
     return found, start
 

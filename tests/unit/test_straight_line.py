@@ -7,19 +7,28 @@ import pytest
 
 from escape_hw.calibration.tracking.live_registration import DoubleExponentialSmoother
 
-KEEP = float(np.exp(-1 / 8))
+MEMORY_S = 8.0
+KEEP = float(np.exp(-1 / MEMORY_S))
 SIGMA = 0.3
 
 
-def follow(truth, noise, *, fastest=0.5, static=0.0):
-    """What comes of a run of updates: estimates are the faded means of truth and noise."""
-    line = DoubleExponentialSmoother(KEEP, 1.0, np.array([fastest]))
+def follow(truth, noise, *, fastest=0.5, static=0.0, durations=None):
+    """What comes of a run of updates: estimates are the faded means of truth and noise.
+
+    Without ``durations`` an update takes a second.
+    """
+    line = DoubleExponentialSmoother(MEMORY_S, np.array([fastest]))
     weight = total = squares = 0.0
     found = []
-    for value in truth + noise:
-        weight, total, squares = KEEP * weight + 1, KEEP * total + value, KEEP**2 * squares + 1
-        variance = SIGMA**2 * squares / weight**2
-        found.append(line.update(np.array([total / weight]), np.array([[variance]]), np.array([[static]])))
+    for value, seconds in zip(truth + noise, durations or np.ones(len(truth)), strict=True):
+        keep = KEEP**seconds
+        weight, total, squares = (
+            keep * weight + seconds,
+            keep * total + seconds * value,
+            keep**2 * squares + seconds,
+        )
+        mean, variance = np.array([total / weight]), np.array([[SIGMA**2 * squares / weight**2]])
+        found.append(line.update(mean, variance, np.array([[static]]), seconds))
     return found
 
 
@@ -32,6 +41,25 @@ def test_a_line_is_followed_without_lag():
     assert found[-1].rate[0] == pytest.approx(0.2, rel=0.02)
     # The faded mean itself lags by its memory.
     assert 0.2 * 8 * 0.9 < 0.2 * 60 - np.average(truth, weights=KEEP ** np.arange(60)[::-1]) < 0.2 * 9
+
+
+def test_updates_of_different_durations_follow_the_same_line_with_correct_errors():
+    rng = np.random.default_rng(8)
+    pulls = []
+    for _ in range(200):
+        durations = rng.choice([0.5, 1.0, 3.0], 20).tolist()
+        ends = np.cumsum(durations)
+        truth, noise = (
+            0.2 * (ends - np.array(durations) / 2),
+            SIGMA * rng.standard_normal(20) / np.sqrt(durations),
+        )
+        calm, last = (
+            follow(truth, 0 * noise, durations=durations)[-1],
+            follow(truth, noise, durations=durations)[-1],
+        )
+        assert abs(calm.value[0] - 0.2 * ends[-1]) < 0.05
+        pulls.append((last.value[0] - 0.2 * ends[-1]) / np.sqrt(last.covariance[0, 0]))
+    assert 0.5 < np.mean(np.square(pulls)) < 1.3
 
 
 @pytest.mark.parametrize("rate", [0.0, 0.3])
@@ -87,7 +115,7 @@ def test_what_bends_too_fast_widens_the_errors():
 
 
 def test_a_restart_forgets():
-    line = DoubleExponentialSmoother(KEEP, 1.0, np.array([0.1]))
+    line = DoubleExponentialSmoother(MEMORY_S, np.array([0.1]))
     one = np.eye(1)
     for value in (1.0, 2.0, 3.0):
         line.update(np.array([value]), 0.01 * one, 0 * one)

@@ -9,6 +9,7 @@ lag of the memory.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -120,10 +121,8 @@ class LiveRegistration:
         at the live registration.
     order, lags
         Order of the whitening filter and length of the temporal response, in frames.
-    memory
-        Updates after which the weight of a frame is ``1 / e``; infinite: no forgetting.
-    step_s
-        Seconds between updates.
+    memory_s
+        Seconds after which the weight of a frame is ``1 / e``; infinite: no forgetting.
     n_curve_coefficients
         Coefficients of the curve of optical gains over the modes; 0: one gain for all modes.
     """
@@ -136,8 +135,7 @@ class LiveRegistration:
         *,
         order: int,
         lags: int,
-        memory: float = 10.0,
-        step_s: float = 1.0,
+        memory_s: float = 10.0,
         n_curve_coefficients: int = 0,
         response: TemporalResponse | None = None,
     ) -> None:
@@ -161,11 +159,9 @@ class LiveRegistration:
         self._order, self._lags, self._response = order, lags, response
         self._basis = gain_curve_basis(template.n_modes, n_curve_coefficients)
         self._command_curves = compute_command_curves(template.m2c, self._basis)
-        self._forgetting_factor = float(np.exp(-1 / memory))
+        self._memory_s = memory_s
         drift_sigma = np.concatenate([_DRIFT_SIGMA, np.full(n_curve_coefficients, _CURVE_DRIFT_SIGMA)])
-        self._drift_line = DoubleExponentialSmoother(
-            self._forgetting_factor if self._forgetting_factor < 1 else 1 - 1e-9, step_s, drift_sigma
-        )
+        self._drift_line = DoubleExponentialSmoother(memory_s, drift_sigma)
         # Fitted matrix at the mean age of the sums, and extrapolated to the present.
         self._matrix = self._current_matrix = template.data.astype(np.float64)
         self._problem: MixedEffectsProblem | None = None
@@ -180,11 +176,11 @@ class LiveRegistration:
         self._updates = 0
         self._drift_line.restart()
 
-    def update(self, data: AlignedTelemetry, start: int = 0) -> LiveEstimate:
+    def update(self, data: AlignedTelemetry, start: int = 0, seconds: float = 1.0) -> LiveEstimate:
         """Estimate the registration with one more block of frames.
 
         ``data``: closed-loop telemetry: slopes, total modal commands, and the pokes in them; ``start``: first
-        new row, after :func:`count_history_rows` rows of history.
+        new row, after :func:`count_history_rows` rows of history; ``seconds``: duration of the new rows.
 
         Raises
         ------
@@ -200,26 +196,29 @@ class LiveRegistration:
         delayed = block.excitation(response.weights)
         if self._state is None:
             # The residual for the matrix in use includes its error: fit once for the noise.
-            self._add_block(block, delayed)
+            self._add_block(block, delayed, seconds)
             problem, system, self._state = self._gauss_newton()
             self._priors = _estimate_priors(problem, self._state, system)
             self._current_matrix, self._sums = self._matrix, ForgettingSums.zeros(*self._template.data.shape)
-        block_sums = self._add_block(block, delayed)
+        block_sums = self._add_block(block, delayed, seconds)
         problem, system, self._state = self._gauss_newton()
         self._updates += 1
-        found = self._build_estimate(problem, system, self._state, block_sums, response)
+        present = self._extrapolate_to_now(problem, system, self._state, seconds)
+        found = self._build_estimate(problem, system, self._state, present, block_sums, response)
         if learning:
             self._priors = _estimate_priors(problem, self._state, system)
         return found
 
-    def _add_block(self, block: FilteredTelemetry, delayed: NDArray[np.float32]) -> ForgettingSums:
-        """Apply the forgetting factor, add a block, and return the sums of the block alone."""
+    def _add_block(
+        self, block: FilteredTelemetry, delayed: NDArray[np.float32], seconds: float
+    ) -> ForgettingSums:
+        """Forget for the duration of a block, add it, and return the sums of the block alone."""
         n_modes = self._template.n_modes
         block_sums = ForgettingSums.zeros(*self._template.data.shape)
         block_sums.add(
             block.slopes, delayed[:, :n_modes], delayed[:, n_modes:], self._current_matrix.astype(np.float32)
         )
-        self._sums.forget(self._forgetting_factor)
+        self._sums.forget(math.exp(-seconds / self._memory_s))
         self._sums.merge(block_sums)
         return block_sums
 
@@ -275,10 +274,10 @@ class LiveRegistration:
         problem: MixedEffectsProblem,
         system: NormalEquations,
         state: MixedEffectsState,
+        present: SmoothedState,
         block_sums: ForgettingSums,
         response: TemporalResponse,
     ) -> LiveEstimate:
-        present = self._extrapolate_to_now(problem, system, state)
         value = present.value
         current_variants = np.concatenate([state.variant[: _first_curve_index(problem)], value[6:]])
         current_state = replace(state, gain=float(value[GAIN]), alpha=value[1:6], variant=current_variants)
@@ -320,7 +319,11 @@ class LiveRegistration:
         )  # fmt: skip
 
     def _extrapolate_to_now(
-        self, problem: MixedEffectsProblem, system: NormalEquations, state: MixedEffectsState
+        self,
+        problem: MixedEffectsProblem,
+        system: NormalEquations,
+        state: MixedEffectsState,
+        seconds: float,
     ) -> SmoothedState:
         """Gain, registration and curve at the present time, without the lag of the memory."""
         first_curve = _first_curve_index(problem)
@@ -332,7 +335,7 @@ class LiveRegistration:
         total_covariance[np.arange(1, 6), np.arange(1, 6)] += np.square(systematic_error(self._model))
         static = _without_negative_variances(total_covariance - noise)
         values = np.concatenate([[state.gain], state.alpha, state.variant[first_curve:]])
-        return self._drift_line.update(values, noise, static)
+        return self._drift_line.update(values, noise, static, seconds)
 
     def _gains_sigma(self, present: SmoothedState, timing_sigma: float) -> NDArray[np.float64]:
         """Standard error of the gain of every mode, from those of the common gain and the curve."""
@@ -402,16 +405,14 @@ class DoubleExponentialSmoother:
 
     Parameters
     ----------
-    forgetting
-        Factor of the earlier weights at each update, in (0, 1).
-    step_s
-        Seconds between updates.
+    memory_s
+        Seconds after which the weight of an update is ``1 / e``; infinite: no forgetting.
     max_rate
         Prior standard deviation of the drift per second ``(n,)``, relevant while the memory fills.
     """
 
-    def __init__(self, forgetting: float, step_s: float, max_rate: NDArray[np.float64]) -> None:
-        self._forgetting, self._step_s, self._max_rate = forgetting, step_s, np.asarray(max_rate, float)
+    def __init__(self, memory_s: float, max_rate: NDArray[np.float64]) -> None:
+        self._memory_s, self._max_rate = memory_s, np.asarray(max_rate, float)
         # Running variance of the innovations; survives a restart.
         self._innovation_variance = np.ones(len(self._max_rate))
         self.restart()
@@ -421,42 +422,52 @@ class DoubleExponentialSmoother:
         n = len(self._max_rate)
         self._weight = 0.0
         self._mean, self._second = np.zeros(n), np.zeros(n)
-        # Weights of the noise of each update in both means, the oldest first.
+        # Durations of the updates, and weights of the noise of each in both means, the oldest first.
+        self._durations = np.zeros(0)
         self._first_shares, self._second_shares = np.zeros(0), np.zeros(0)
-        self._expected: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
+        # Value, rate and variance of the last update.
+        self._last: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]] | None = None
         self._mean_innovation, self._curvature_variance = np.zeros(n), np.zeros(n)
 
     def update(
-        self, mean: NDArray[np.float64], noise: NDArray[np.float64], static: NDArray[np.float64]
+        self,
+        mean: NDArray[np.float64],
+        noise: NDArray[np.float64],
+        static: NDArray[np.float64],
+        seconds: float = 1.0,
     ) -> SmoothedState:
         """Add the estimate from the forgotten sums.
 
         ``mean``: the estimate ``(n,)``; ``noise``, ``static``: covariances ``(n, n)`` of its noise,
-        independent from frame to frame, and of its constant errors.
+        independent from frame to frame, and of its constant errors; ``seconds``: duration of the new data.
         """
-        self._weight = self._forgetting * self._weight + 1
-        share = 1 / self._weight
+        self._weight = math.exp(-seconds / self._memory_s) * self._weight + seconds
+        share = seconds / self._weight
         new_estimate = self._mean + (mean - self._mean) / share
+        self._durations = np.append(self._durations, seconds)
         self._first_shares = np.append(self._first_shares * (1 - share), share)
         self._second_shares = np.append(self._second_shares * (1 - share), 0) + share * self._first_shares
         self._mean, self._second = mean, self._second + share * (mean - self._second)
-        first, second = self._first_shares, self._second_shares
-        ages = self._step_s * (np.arange(len(first))[::-1] + 0.5)
+        first, second, durations = self._first_shares, self._second_shares, self._durations
+        ages = np.cumsum(durations[::-1])[::-1] - durations / 2
         first_age, second_age = float(first @ ages), float(second @ ages)
-        single_update_covariance = noise / float(first @ first)
+        # The noise of an update falls with its duration.
+        noise_of_a_second = noise / float(first @ (first / durations))
         value, rate, variance = mean, np.zeros_like(mean), np.square(first_age * self._max_rate)
         shares = np.broadcast_to(first, (len(mean), len(first)))
         if second_age > first_age:
             unshrunk_rate = (mean - self._second) / (second_age - first_age)
-            rate_variance = np.diag(single_update_covariance) * float(np.square(first - second).sum())
+            rate_variance = np.diag(noise_of_a_second) * float((np.square(first - second) / durations).sum())
             rate_variance = rate_variance / (second_age - first_age) ** 2
             shrinkage = np.square(self._max_rate) / (np.square(self._max_rate) + rate_variance)
             rate = shrinkage * unshrunk_rate
             value = mean + first_age * rate
             shares = first + (shrinkage * first_age / (second_age - first_age))[:, None] * (first - second)
             variance = np.square(first_age * self._max_rate * (1 - shrinkage))
-        random_covariance = single_update_covariance * (shares @ shares.T) + np.diag(variance)
-        raw_innovation, curvature_variance = self._compute_innovation(new_estimate, single_update_covariance)
+        random_covariance = noise_of_a_second * ((shares / durations) @ shares.T) + np.diag(variance)
+        raw_innovation, curvature_variance = self._compute_innovation(
+            new_estimate, noise_of_a_second / seconds, seconds
+        )
         innovation = raw_innovation / np.sqrt(np.maximum(self._innovation_variance, 1.0))
         self._innovation_variance += _LEARNING_RATE * (
             np.minimum(np.square(raw_innovation), _MAX_INNOVATION) - self._innovation_variance
@@ -464,14 +475,12 @@ class DoubleExponentialSmoother:
         error_scale = np.sqrt(np.maximum(self._innovation_variance, 1.0))
         random_covariance = random_covariance * np.outer(error_scale, error_scale)
         random_covariance = random_covariance + np.diag(curvature_variance)
-        present = SmoothedState(value, rate, static + random_covariance, random_covariance, innovation)
-        # The data of the next update have a mean age of half a step.
-        self._expected = value + 0.5 * self._step_s * rate, np.diag(random_covariance)
+        self._last = value, rate, np.diag(random_covariance)
         self._trim()
-        return present
+        return SmoothedState(value, rate, static + random_covariance, random_covariance, innovation)
 
     def _compute_innovation(
-        self, new_estimate: NDArray[np.float64], single_update_covariance: NDArray[np.float64]
+        self, new_estimate: NDArray[np.float64], covariance: NDArray[np.float64], seconds: float
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Innovation in standard errors, and variance due to a curvature of the drift.
 
@@ -479,21 +488,23 @@ class DoubleExponentialSmoother:
         running mean beyond its noise is added to the variance, and decays slowly, because an oscillation
         turns round.
         """
-        if self._expected is None or len(self._first_shares) < _MIN_UPDATES:
+        if self._last is None or len(self._first_shares) < _MIN_UPDATES:
             return np.zeros_like(new_estimate), np.zeros_like(new_estimate)
-        value, variance = self._expected
-        noise = np.diag(single_update_covariance) + variance
-        raw_innovation = new_estimate - value
+        value, rate, variance = self._last
+        noise = np.diag(covariance) + variance
+        # The new data have a mean age of half their duration.
+        raw_innovation = new_estimate - (value + 0.5 * seconds * rate)
         self._mean_innovation += _LEARNING_RATE * (raw_innovation - self._mean_innovation)
         threshold = _BIAS_THRESHOLD * noise * _LEARNING_RATE / (2 - _LEARNING_RATE)
         excess = np.square(self._mean_innovation) - threshold
         self._curvature_variance = np.maximum(excess, self._curvature_variance * (1 - _LEARNING_RATE / 2))
-        sigma = np.sqrt(noise + np.square(self._step_s * self._max_rate))
+        sigma = np.sqrt(noise + np.square(seconds * self._max_rate))
         return raw_innovation / sigma, self._curvature_variance
 
     def _trim(self) -> None:
         """Drop the oldest weights once they are negligible."""
-        if len(self._first_shares) > 40 / (1 - self._forgetting):
-            half = len(self._first_shares) // 2
+        if self._durations.sum() > 40 * self._memory_s:
+            half = len(self._durations) // 2
+            self._durations = self._durations[half:]
             self._first_shares = self._first_shares[half:]
             self._second_shares = self._second_shares[half:]

@@ -154,7 +154,7 @@ class _Tracker:
             )
         amplitude = compute_poke_amplitudes(bench, matrix.m2c, poke)
         self.pokes = RandomPokes(amplitude, bench.rng)
-        self.response, self.memory = response, forgetting_time_s / STEP_S
+        self.response, self.memory_s = response, forgetting_time_s
         self.dropped = bench.config.loop.dropped_modes
         self.in_use = ActiveReconstructor(matrix, invert_matrix(matrix, self.dropped), start, 1.0)
         self.start = start.registration
@@ -181,7 +181,7 @@ class _Tracker:
         self.model = bench.model(self.grid)
         self.live = LiveRegistration(
             matrix, self.model, start, order=c.whiten_order, lags=c.lags,
-            memory=self.memory, step_s=STEP_S, response=self.response,
+            memory_s=self.memory_s, response=self.response,
             n_curve_coefficients=len(COEFFICIENT_SIGMA) if bench.config.sensor.kind == "pyramid" else 0,
         )  # fmt: skip
         unit = compute_fitted_matrix(self.model, start.registration, start, matrix.m2c)
@@ -266,7 +266,8 @@ class _Tracker:
     ) -> TrackerUpdate | None:
         """Update for a block of frames, ``None`` if there are too few; in the worker thread."""
         try:
-            live = self.live.update(data, start)
+            new_s = (len(data.rows) - start) / self.bench.wfs.settings.frame_rate_hz
+            live = self.live.update(data, start, new_s)
         except TooFewFrames:
             return None
         synthetic = synthesise_calibration(
