@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import shlex
 from collections.abc import Mapping, Sequence
 from contextlib import closing, nullcontext
@@ -9,9 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import click
 import typer
-from click.core import ParameterSource
 
 from escape_hw.cli import options
 from escape_hw.cli.command import command
@@ -32,8 +31,8 @@ if TYPE_CHECKING:
     from escape_hw.runtime.sweep.workers import Workers
 
 
-#: Options that a sweep to resume may have beside its folder; all others describe a new one.
-_RESUMABLE = {"resume", "workers", "scheduler", "storage", "out", "json", "quiet"}
+#: Arguments that a sweep to resume may have; all others describe a new one.
+_RESUMABLE = {"resume", "workers", "scheduler", "storage", "out"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,6 +123,7 @@ def sweep(
     out: options.Out = None,
 ) -> None:
     """Compare matrices, each at its own best gain, leak and number of modes, on the same turbulence."""
+    arguments = dict(locals())
     from escape_hw.runtime.sweep.request import require_optuna
 
     require_optuna()
@@ -135,7 +135,7 @@ def sweep(
 
     given: SweepDescription | _Request
     if resume is not None:
-        _refuse_new_options()
+        _refuse_new_options(selection, arguments)
         given = read_description(resume, storage)
         config = context.load_config(selection := replace(selection, system=str(resume / "config.toml")))
         if _show_finished(context, resume, given):
@@ -159,17 +159,14 @@ def sweep(
         _run(context, selection, given, folder, pool)
 
 
-def _refuse_new_options() -> None:
-    """Raise if the command line describes a new sweep beside the one to resume."""
-    context = click.get_current_context()
-    given = [
-        f"--{name.replace('_', '-')}"
-        for name in context.params
-        if context.get_parameter_source(name) is ParameterSource.COMMANDLINE and name not in _RESUMABLE
-    ]
-    if given:
+def _refuse_new_options(selection: options.SystemSelection, values: Mapping[str, Any]) -> None:
+    """Raise if the arguments of :func:`sweep` describe a new sweep beside the one to resume."""
+    known = inspect.signature(sweep).parameters
+    given = [name for name, value in values.items() if name in known and value != known[name].default]
+    given += [name for name in ("set", "seed", "mode") if getattr(selection, name) not in (None, ())]
+    if refused := [f"--{name.replace('_', '-')}" for name in given if name not in _RESUMABLE]:
         raise ConfigError(
-            f"{', '.join(given)}: a sweep that is resumed keeps its own; leave it out, or start a new sweep"
+            f"{', '.join(refused)}: a sweep that is resumed keeps its own; leave it out, or start a new sweep"
         )
 
 
