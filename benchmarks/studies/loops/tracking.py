@@ -143,11 +143,13 @@ def band(panel: Any, t: Any, value: Any, sigma: Any) -> None:
 def picture(rows: dict[str, Any], truth: Any, gains: Any, others: dict[str, Any]) -> Figure:
     """Shift and its error, rotation, gain, Strehl ratio and its loss, against time."""
     figure = style.new_figure(9.2, 9.0)
+    figure.set_layout_engine("constrained", rect=(0, 0, 1, 0.985))
     panels = list(figure.subplots(3, 2, sharex=True).ravel())
     if not others:
         # Nothing to compare the Strehl ratio with.
         panels.pop().remove()
         panels[3].tick_params(labelbottom=True)
+        panels[3].set_xlabel("seconds")
     t = rows["seconds"]
     for panel, name, k, title in (
         (panels[0], "shift_x", 0, "shift x [% of a sub-aperture]"),
