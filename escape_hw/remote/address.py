@@ -8,6 +8,7 @@ import os
 import re
 import stat
 import tempfile
+import warnings
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -70,7 +71,10 @@ def runtime_folder() -> Path:
         It cannot be created, belongs to another user, or other users can write to it.
     """
     try:
-        folder = Path(platformdirs.user_runtime_dir("escape", appauthor=False))
+        # platformdirs warns of a folder that the login session did not make; see below for what is refused.
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            folder = Path(platformdirs.user_runtime_dir("escape", appauthor=False))
     except OSError as error:
         # Its text names the folder, and XDG_RUNTIME_DIR as the remedy.
         raise StorageError(str(error)) from error

@@ -65,6 +65,22 @@ def test_report_states_what_was_done() -> None:
     np.testing.assert_allclose(safe, -0.1)
 
 
+@pytest.mark.parametrize(
+    ("limits", "shape"),
+    [
+        (MirrorLimits(max_stroke=0.5), 0.5 * np.eye(N)[3]),
+        (MirrorLimits(max_mean=0.1), np.full(N, 0.1)),
+        (MirrorLimits(max_neighbour=0.1), 0.1 * np.eye(N)[6]),
+        (MirrorLimits(max_abs_sum=1.0), np.full(N, 1.0 / N)),
+    ],
+    ids=["stroke", "mean", "neighbour", "sum"],
+)
+def test_a_little_beyond_a_limit_is_beyond_it(limits: MirrorLimits, shape: NDArray[np.float64]) -> None:
+    within, beyond = 0.98 * shape, 1.02 * shape
+    np.testing.assert_array_equal(guard_with(limits)(within)[0], within)
+    np.testing.assert_allclose(guard_with(limits)(beyond)[0], shape, atol=1e-6)
+
+
 def test_one_actuator_far_away_does_not_hold_the_others_back() -> None:
     command = np.full(N, 0.05)
     command[7] = 1.0

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import shlex
 import stat
+import warnings
 from pathlib import Path
 
 import pytest
 
 from escape_hw.errors import ConfigError, StorageError
 from escape_hw.remote import keys
-from escape_hw.remote.address import find_server, is_loopback, resolve, running_servers
+from escape_hw.remote.address import find_server, is_loopback, resolve, running_servers, runtime_folder
 
 OTHER = "X8nS7Q1AbBe5qEMxbWkJSWPHmZc84UmvUYdVdpc1"
 
@@ -126,6 +127,16 @@ def test_a_runtime_folder_that_others_may_write_to_is_not_used(home: Path) -> No
     (home / "escape").chmod(0o777)
     with pytest.raises(StorageError, match="other users can write there"):
         find_server("razor-shwfs")
+
+
+def test_no_warning_where_the_login_session_has_no_runtime_folder(home, monkeypatch, recwarn) -> None:
+    def fall_back(*_: object, **__: object) -> str:
+        warnings.warn("XDG_RUNTIME_DIR is not set, falling back", RuntimeWarning, stacklevel=2)
+        return str(home / "fallen back")
+
+    monkeypatch.setattr("escape_hw.remote.address.platformdirs.user_runtime_dir", fall_back)
+    assert runtime_folder() == home / "fallen back"
+    assert not recwarn.list
 
 
 def test_a_runtime_folder_of_another_user_is_refused(escape, monkeypatch: pytest.MonkeyPatch) -> None:
