@@ -23,6 +23,10 @@ MUTATIONS = {
         "escape_hw/safety/guard.py", "shape = _clamp(shape, lim.max_stroke)", "shape = _clamp(shape, 1e3)",
         "tests/unit/test_guard.py::test_whatever_goes_in_what_comes_out_obeys",
     ),
+    "sum of all commands in the compiled check": (
+        "escape_hw/safety/compiled_check.py", "if not total <= max_abs_sum:",
+        "if not total <= 2 * max_abs_sum:", "tests/unit/test_guard_action.py",
+    ),
     "leak of the integrator": (
         "escape_hw/pipeline/control/integrator.py", "np.float32(1 - leak)", "np.float32(1)",
         "tests/unit/test_integrator.py",
@@ -62,6 +66,13 @@ MUTATIONS = {
 }  # fmt: skip
 
 
+def failures(tests: str, copy: Path, environment: dict[str, str]) -> list[str]:
+    """Lines of pytest that name the tests that failed in a copy."""
+    words = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", tests]
+    done = subprocess.run(words, cwd=copy, env=environment, capture_output=True, text=True)
+    return [row for row in done.stdout.splitlines() if row.startswith(("FAILED", "ERROR"))]
+
+
 def main() -> int:
     """Number of mutations that nothing noticed."""
     unnoticed = 0
@@ -75,11 +86,11 @@ def main() -> int:
             text = (copy / file).read_text(encoding="utf-8")
             if text.count(line) != 1:
                 raise SystemExit(f"{name}: {file} has the line {text.count(line)} times: {line}")
+            if failed := failures(tests, copy, environment):
+                raise SystemExit(f"{name}: fails without a mutation: {failed[0]}")
             (copy / file).write_text(text.replace(line, mutated), encoding="utf-8")
-            words = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", tests]
-            done = subprocess.run(words, cwd=copy, env=environment, capture_output=True, text=True)
+            failed = failures(tests, copy, environment)
             (copy / file).write_text(text, encoding="utf-8")
-            failed = [row for row in done.stdout.splitlines() if row.startswith(("FAILED", "ERROR"))]
             unnoticed += not failed
             print(f"{name}: {failed[0].partition(' - ')[0] if failed else 'NOT NOTICED'}", flush=True)
     return unnoticed
