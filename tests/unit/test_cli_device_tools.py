@@ -45,7 +45,7 @@ def test_dm_verbs_have_their_documents(document):
     ):
         code, found, _ = document("dm", *verb)
         # A busy computer may be late for some commands of so short a wave.
-        assert code == 0 or found.get("missed"), verb
+        assert code == 0 or (code == 1 and found.get("missed")), verb
         assert {"schema", "system", "simulated", "seed", "changed"} | keys <= set(found)
         assert found["command"] == f"dm {verb[0]}"
         assert found["simulated"] is True

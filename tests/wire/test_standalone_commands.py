@@ -24,7 +24,7 @@ def test_a_mirror_is_moved_by_its_driver(document) -> None:
     assert (code, found["peak"], found["asked"]["actuator"]) == (0, 0.05, 48)
     code, found, _ = document("dm", "wave", *words, "--seconds", 0.1)
     # A busy computer may be late for some commands of so short a wave.
-    assert code == 0 or found["missed"]
+    assert code == 0 or (code == 1 and found["missed"])
     code, found, _ = document("dm", "status", *words, "--set", "limits.max_stroke=0.3")
     assert (found["n_act"], found["stroke_m"], found["limits"]["max_stroke"]) == (97, None, 0.3)
     assert not stand_in("asdk").violations
