@@ -8,6 +8,8 @@ from typing import Annotated
 
 import typer
 
+from escape_hw.cli.completion import complete_driver, complete_system
+
 Json = Annotated[bool, typer.Option("--json", help="Print exactly one JSON document on standard output.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress bars.")]
 Out = Annotated[
@@ -29,6 +31,7 @@ Driver = Annotated[
         "--driver",
         metavar="NAME",
         help="Driver of a real device, in place of a system; --set then gives its settings.",
+        autocompletion=complete_driver,
     ),
 ]
 Serial = Annotated[
@@ -62,16 +65,25 @@ class SystemSelection:
 
 #: A command's system, named by its argument; see :func:`~escape_hw.cli.command.command`.
 Selection = Annotated[
-    SystemSelection, typer.Argument(help="Name of a system (see 'escape systems') or a TOML file.")
+    SystemSelection,
+    typer.Argument(
+        help="Name of a system (see 'escape systems') or a TOML file.", autocompletion=complete_system
+    ),
 ]
 #: A system or, with ``--driver``, none; see :class:`~escape_hw.cli.devices.device_tools.DeviceCommand`.
 DeviceSelection = Annotated[
     SystemSelection,
-    typer.Argument(help="Name of a system (see 'escape systems') or a TOML file; none with --driver."),
+    typer.Argument(
+        help="Name of a system (see 'escape systems') or a TOML file; none with --driver.",
+        autocompletion=complete_system,
+    ),
 ]
 #: Default of a command whose argument may be left out.
 NO_SYSTEM = SystemSelection("")
 OptionalSelection = Annotated[
     SystemSelection,
-    typer.Argument(help="Name of a system (see 'escape systems') or a TOML file; not with --resume."),
+    typer.Argument(
+        help="Name of a system (see 'escape systems') or a TOML file; not with --resume.",
+        autocompletion=complete_system,
+    ),
 ]

@@ -9,6 +9,7 @@ import typer
 
 from escape_hw.cli import options
 from escape_hw.cli.command import command
+from escape_hw.cli.completion import complete_system
 from escape_hw.cli.context import CommandContext
 
 if TYPE_CHECKING:
@@ -45,7 +46,10 @@ def _describe(config: SystemConfig) -> dict[str, Any]:
 def check(
     context: CommandContext,
     selection: Annotated[
-        options.SystemSelection, typer.Argument(metavar="FILE", help="TOML file, or the name of a system.")
+        options.SystemSelection,
+        typer.Argument(
+            metavar="FILE", help="TOML file, or the name of a system.", autocompletion=complete_system
+        ),
     ],
 ) -> None:
     """Check a configuration; reports all errors with file, line, key and allowed range."""
@@ -59,7 +63,9 @@ def check(
 def init(
     context: CommandContext,
     name: Annotated[str, typer.Argument(help="Name of the new system.")] = "my-system",
-    base: Annotated[str, typer.Option("--base", help="System whose values are used.")] = "razor-shwfs",
+    base: Annotated[
+        str, typer.Option("--base", help="System whose values are used.", autocompletion=complete_system)
+    ] = "razor-shwfs",
     out: Annotated[
         Path | None, typer.Option("--out", metavar="FILE", help="File to write (default: standard output).")
     ] = None,

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from escape_hw.cli.command import command
+from escape_hw.cli.completion import complete_system
 from escape_hw.cli.context import CommandContext
 from escape_hw.cli.options import NO_SYSTEM, SystemSelection
 
@@ -18,7 +19,10 @@ _SYMBOLS = {"ok": "✓", "info": "·", "warning": "!", "error": "✗"}
 def doctor(
     context: CommandContext,
     selection: Annotated[
-        SystemSelection, typer.Argument(help="System whose real devices must work (default: none).")
+        SystemSelection,
+        typer.Argument(
+            help="System whose real devices must work (default: none).", autocompletion=complete_system
+        ),
     ] = NO_SYSTEM,
 ) -> None:
     """Check that this computer is set up for real devices. Opens none.
