@@ -111,11 +111,21 @@ def test_the_desktop_entry_starts_the_window() -> None:
 
 
 def test_the_hosted_run_is_the_local_one() -> None:
-    run, container = text(".github/workflows/ci.yml").split("\n  container:\n")
-    steps = re.findall(r"^ +- run: (.*)$", run, re.MULTILINE)
-    assert steps == ["sudo python3 tests/system_packages.py --install", ".ci/run"]
-    assert "docker build --file Containerfile --tag escape ." in container
-    assert "docker run --rm escape --version" in container
+    head, *jobs = re.split(
+        r"^  (\w+):\n", text(".github/workflows/ci.yml").split("\njobs:\n")[1], flags=re.MULTILINE
+    )
+    steps = {
+        name: re.findall(r"^ +- run: (.*)$", job, re.MULTILINE)
+        for name, job in zip(jobs[::2], jobs[1::2], strict=True)
+    }
+    install = "sudo python3 tests/system_packages.py --install"
+    assert not head
+    assert steps == {
+        "run": [install, ".ci/run"],
+        "everything": [install, "make test-all"],
+        "constraints": [install, "make test CONSTRAINTS=constraints.txt"],
+        "container": ["docker build --file Containerfile --tag escape .", "docker run --rm escape --version"],
+    }
 
 
 def test_every_python_that_the_package_names_is_tested() -> None:
