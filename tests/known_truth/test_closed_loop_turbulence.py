@@ -14,7 +14,7 @@ from escape_hw.api.registration import Registration
 from escape_hw.calibration.acquisition.slope_statistics import SlopeStatistics
 from escape_hw.pipeline.slopes.pyramid import slopes_of_image
 from escape_sim.models.pyramid import PyramidModel, nominal_pupils
-from escape_sim.models.pyramid_turbulence import unit_screens
+from escape_sim.models.pyramid_turbulence import Turbulence, sample_distances, unit_screens
 
 #: Pupil diameters over r0, and fraction of the amplitude of the modes that the loop leaves.
 STRENGTH, LEFT = 12.0, 0.15
@@ -67,6 +67,45 @@ def test_the_strength_and_what_the_loop_leaves_are_found(loop: Loop) -> None:
     assert model._phases.left == pytest.approx(LEFT, rel=0.25)
     # A model of the open loop takes the small motion for weak turbulence.
     assert PyramidModel(loop.config, replace(loop.geometry, residual_tilt=0.0)).turbulence < STRENGTH / 2
+
+
+def test_the_structure_of_pairs_is_that_of_what_modes_leave() -> None:
+    n, lit = 16, np.hypot(*np.indices((16, 16)) - 7.5) < 8
+    modes = np.stack(
+        [np.indices((n, n))[0], np.indices((n, n))[1], np.square(np.indices((n, n)) - 7.5).sum(0)]
+    )
+    turbulence = Turbulence(4.0, sample_distances(n, 1 / n), lit, modes.astype(float))
+    turbulence.left = LEFT
+    found = turbulence.pair_structure(STRENGTH)
+    assert found is not None
+    # Whole turbulence of many states, of which the modes take their share.
+    between = turbulence.structure(STRENGTH)
+    rows, columns = np.nonzero(lit)
+    covariance = 100 - between[rows[:, None] - rows + n - 1, columns[:, None] - columns + n - 1] / 2
+    rng = np.random.default_rng(0)
+    states = np.linalg.cholesky(covariance) @ rng.standard_normal((len(rows), 4000))
+    basis = np.linalg.qr(np.vstack([modes[:, lit], np.ones(len(rows))]).T)[0]
+    states -= (1 - LEFT) * basis @ (basis.T @ states)
+    pairs = rng.integers(len(rows), size=(2, 500))
+    want = np.mean(np.square(states[pairs[0]] - states[pairs[1]]), axis=1)
+    assert found[tuple(pairs)] == pytest.approx(want, rel=0.12, abs=1e-3)
+    assert Turbulence(4.0, sample_distances(n, 1 / n), lit).pair_structure(STRENGTH) is None
+
+
+def test_a_loop_that_stands_at_a_tilt_is_found(loop: Loop) -> None:
+    # References are the mean slopes of a wavefront with this tilt in lambda/D, under what the loop leaves.
+    tilt = np.array([0.5, -0.8])
+    n = loop.phases.shape[1]
+    y, x = (np.indices((n, n)) - (n - 1) / 2) / n
+    tilted = [loop.slopes(phase + 2 * np.pi * (tilt[0] * x + tilt[1] * y)) for phase in loop.phases]
+    mean = np.mean(tilted, axis=0).reshape(2, -1).mean(axis=1)
+    references = np.tile(mean, (loop.pupils.valid.sum(), 1)).astype(np.float32)
+    model = PyramidModel(loop.config, replace(loop.geometry, references=references))
+    assert model._modulation.points.mean(axis=0) == pytest.approx(tilt, abs=0.08)
+    for variant in model.variants():
+        assert variant._modulation.points.mean(axis=0) == pytest.approx(
+            model._modulation.points.mean(axis=0), abs=1e-9
+        )
 
 
 def test_the_mean_response_has_the_size_of_frames(loop: Loop) -> None:

@@ -72,10 +72,10 @@ class Bare:
             power += self.modulation.weight * np.abs(np.fft.ifft2(wide)) ** 2
         return power.reshape(self.grid, self.samples, self.grid, self.samples).sum(axis=(1, 3))
 
-    def response(self, structure=None, interpolation=None):
+    def response(self, structure=None, interpolation=None, pairs=None):
         return slope_response(
             self.light, self.prism, self.grid * self.samples, self.pupils.corners_px, self.pupils.valid,
-            self.modulation, structure, interpolation=interpolation, samples=self.samples,
+            self.modulation, structure, pairs=pairs, interpolation=interpolation, samples=self.samples,
             local=self.normalisation == "local",
         )  # fmt: skip
 
@@ -160,6 +160,42 @@ def test_mean_derivatives_are_those_of_frames_under_turbulence(ratio):
         assert (measured @ ours) / (ours @ ours) == pytest.approx(1, abs=0.1)
         assert np.linalg.norm(measured - ours) < 0.25 * np.linalg.norm(ours)
         assert (measured @ rest) / (rest @ rest) < (0.85 if ratio > 5 else 1.0)
+
+
+@pytest.mark.parametrize("path", ["ellipse", "no symmetry"])
+@pytest.mark.parametrize(("samples", "normalisation"), [(1, "global"), (2, "local")])
+def test_all_pairs_give_what_the_convolution_gives(samples, normalisation, path):
+    bare = Bare(samples, normalisation)
+    if path == "no symmetry":
+        bare.modulation = ModulationPath(np.array([[1.0, 0.2], [-0.5, 1.4], [0.3, -2.0]]))
+    n = len(bare.light)
+    structure = Screens(n, 5.0).structure()
+    rows, columns = np.nonzero(bare.light)
+    pairs = structure[rows[:, None] - rows + n - 1, columns[:, None] - columns + n - 1].astype(np.float32)
+    by_pairs, by_distance = bare.response(pairs=pairs), bare.response(structure)
+    assert by_pairs.flat == pytest.approx(by_distance.flat, abs=1e-6)
+    difference = by_pairs.phase_derivatives - by_distance.phase_derivatives
+    assert np.linalg.norm(difference) < 1e-5 * np.linalg.norm(by_distance.phase_derivatives)
+
+
+def test_phases_that_are_not_stationary_are_averaged_over_exactly():
+    # One mode, strong on one side of the pupil, whose Gaussian amplitude is integrated by quadrature.
+    bare, step = Bare(radius=1.0), 1e-3
+    mode, poke = 1.5 * bare.x * (1 + bare.x) * (1 - bare.y), np.cos(3 * bare.x + bare.y)
+    lit = bare.light > 0
+    pairs = np.square(mode[lit][:, None] - mode[lit]).astype(np.float32)
+    light, by = 0.0, 0.0
+    nodes, weights = np.polynomial.hermite_e.hermegauss(40)
+    for amplitude, weight in zip(nodes, weights / weights.sum(), strict=True):
+        sides = [bare.differences(amplitude * mode + s * step * poke) for s in (1, -1)]
+        light = light + weight * np.mean(sides, axis=0)
+        by = by + weight * np.subtract(*sides) / (2 * step)
+    norm = light[2].mean()
+    want = ((by[:2] - light[:2] * by[2].mean() / norm) / norm).ravel()
+    ours = bare.response(pairs=pairs).phase_derivatives @ poke.ravel()
+    assert np.linalg.norm(ours - want) < 1e-4 * np.linalg.norm(want)
+    without = bare.response().phase_derivatives @ poke.ravel()
+    assert np.linalg.norm(without - want) > 0.1 * np.linalg.norm(want)
 
 
 def test_the_structure_function_is_that_of_the_spectrum():

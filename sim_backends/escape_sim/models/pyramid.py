@@ -137,7 +137,8 @@ class PyramidModel(DesignModel):
             turbulence = estimate_strength(self.optics(), pupils, self._phases.phases(1.0), self._pokes)
         self.turbulence = turbulence if turbulence >= _NEGLIGIBLE_STRENGTH else 0.0
         if phases is None and self.turbulence and pupils.residual_tilt:
-            self._phases.estimate_left(self.optics(), pupils, self.turbulence, self._pokes)
+            tilt = self._phases.estimate_left(self.optics(), pupils, self.turbulence, self._pokes)
+            self._modulation = self._modulation.displaced(tilt * pupil.n_sub * pupil.n_pix)
         sigma = self._gaussian.pitch_m / np.sqrt(2 * np.log(1 / self._gaussian.coupling))
         if not isinstance(self._nominal, InfluenceFunctions):
             sigma *= _SHARPER
@@ -280,7 +281,8 @@ class PyramidModel(DesignModel):
                 elliptic = ModulationPath.circle(
                     radius, ellipse=section.ellipticity_sigma, ellipse_angle=angle
                 )
-                changes.append(self._variant(modulation=elliptic))
+                centre = self._modulation.points.mean(axis=0)
+                changes.append(self._variant(modulation=elliptic.displaced(centre)))
             for axis in range(2):
                 centres = self._pupils.centres_px.copy()
                 centres[:, axis] += section.image_position_sigma_px * _DIAGONALS
@@ -353,17 +355,25 @@ class PyramidModel(DesignModel):
         shape = self._config.devices.wfs.region[:1:-1]
         grid = next_fast_length(max(shape), samples)
         region = GridRegion(pupils.centres_px, shape, grid, samples)
-        structure = None
-        if self.turbulence or self._pokes:
+        structure, nonuniform, pairs = None, None, self._pair_structure()
+        if pairs is None and (self.turbulence or self._pokes):
             structure = np.zeros((2 * n - 1, 2 * n - 1))
             if self.turbulence:
                 structure = self._phases.structure(self.turbulence)
+            nonuniform = None if self._pokes is None else self._pokes.nonuniform()
         return slope_response(
             pupil.amplitude, Prism(region.shifts(n), pupil.n_sub * samples), grid * samples,
             pupils.corners_px - region.first, pupils.valid, self._modulation, structure,
-            nonuniform=None if self._pokes is None else self._pokes.nonuniform(),
+            nonuniform=nonuniform, pairs=pairs,
             interpolation=self._interpolation, samples=samples, local=pupils.normalisation == "local",
         ).phase_derivatives  # fmt: skip
+
+    def _pair_structure(self) -> NDArray[np.float32] | None:
+        """Structure function of all pairs of lit samples in closed loop, with pokes; else ``None``."""
+        pairs = self._phases.pair_structure(self.turbulence) if self.turbulence else None
+        if pairs is not None and self._pokes is not None:
+            pairs += self._pokes.pair_structure()
+        return pairs
 
     def optics(self) -> PyramidOptics:
         """Optics of the design's sensor, with the images at their measured positions."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -96,6 +96,54 @@ class TurbulentCorrelations:
             yield filter_.result
 
 
+class PairwiseCorrelations:
+    """Correlations of a modulation under phases that are not stationary: products with all pairs' coherence.
+
+    ``light`` and ``kernel`` are as for :class:`TurbulentCorrelations`, ``structure`` is the structure
+    function of all pairs of lit samples ``(k, k)`` in rad^2, rows of the pupil one after another.
+    """
+
+    def __init__(
+        self,
+        light: NDArray[np.float32],
+        kernel: NDArray[np.complex64],
+        diameter: float,
+        modulation: ModulationPath,
+        structure: NDArray[np.float32],
+    ) -> None:
+        lit = light > 0
+        self._kernel, self._lit = kernel, lit
+        self._rows, self._columns = np.nonzero(lit)
+        at = np.stack([self._columns, self._rows], axis=1) * (2 * np.pi / diameter)
+        # About its centre a circle or an ellipse is symmetric, and its coherence real.
+        centre = modulation.points.mean(axis=0)
+        tilts = np.exp(1j * at @ (modulation.points - centre).T) * np.sqrt(modulation.weight)
+        coherence = tilts.conj() @ tilts.T
+        if np.abs(coherence.imag).max() < _NEGLIGIBLE_PART:
+            coherence = coherence.real
+        single = np.float32 if np.isrealobj(coherence) else np.complex64
+        # Characteristic function of a Gaussian phase.
+        self._coherence = coherence.astype(single) * np.exp(np.float32(-0.5) * structure)
+        self._tilt = np.exp(1j * at @ centre).astype(np.complex64)
+        self._light = light[lit] * self._tilt.conj()
+
+    def correlations(self, pixels: NDArray[np.intp]) -> Iterator[NDArray[np.complex64]]:
+        """Yield ``n`` rows of ``n`` samples for each (row, column) ``u`` in ``pixels``."""
+        n, count = len(self._lit), len(pixels)
+        at = pixels[:, :, None] + (n - 1)
+        fields = self._kernel[at[:, 0] - self._rows, at[:, 1] - self._columns].conj() * self._light
+        if np.isrealobj(self._coherence):
+            parts = np.concatenate([fields.real, fields.imag]) @ self._coherence
+            products = parts[:count] + 1j * parts[count:]
+        else:
+            products = fields @ self._coherence
+        products *= self._tilt
+        result = np.zeros((n, n), np.complex64)
+        for product in products:
+            result[self._lit] = product
+            yield result
+
+
 def _convolution(kernel: NDArray[np.complex128], n: int) -> FourierFilter:
     """Convolution of fields of ``n`` samples with a kernel ``(2 n - 1, 2 n - 1)``."""
     size = next_fast_length(2 * n - 1)
@@ -119,8 +167,14 @@ def coherence(
     return np.asarray((y * modulation.weight) @ x.T * np.exp(-0.5 * structure))
 
 
+#: Correlations of the field at pixels with that in the pupil, of one of three kinds.
+_Correlations = ModulatedCorrelations | TurbulentCorrelations | PairwiseCorrelations
 #: Threads that share the pixels.
 _WORKERS = 2
+#: Camera pixels whose correlations are computed together: enough for an efficient matrix product.
+_BLOCK = 16
+#: Imaginary part of a coherence that is due to rounding.
+_NEGLIGIBLE_PART = 1e-9
 #: Sign of each image in the x and the y slope: upper left, upper right, lower left, lower right.
 _SIGNS = np.array([[-1, -1], [1, -1], [-1, 1], [1, 1]], np.float32)
 
@@ -180,6 +234,7 @@ def slope_response(
     structure: NDArray[np.float64] | None = None,
     *,
     nonuniform: NonuniformPhase | None = None,
+    pairs: NDArray[np.float32] | None = None,
     interpolation: NDArray[np.float32] | None = None,
     samples: int = 1,
     local: bool = False,
@@ -188,8 +243,8 @@ def slope_response(
 
     With ``a(d)`` the point response of the prism, the field of one modulation point is ``E(u) = sum_p
     a(u - p) f(p)``, so ``dI(u)/dphi(p) = -2 Im(a(u - p) conj(E(u)) f(p))``. The mean of ``conj(E(u))
-    f(p)`` over modulation points is a matrix product; over Gaussian phases it is, exactly, the
-    convolution ``A(p) sum_q conj(a(u - q)) A(q) C(p - q)`` with the coherence ``C``. The
+    f(p)`` over modulation points is a matrix product; over Gaussian phases it is, exactly, ``A(p) sum_q
+    conj(a(u - q)) A(q) C(p, q)`` with the coherence ``C``: a convolution if the phases are stationary. The
     normalisation is differentiated too; under turbulence the mean of a quotient is approximated by the
     quotient of the means.
 
@@ -210,6 +265,9 @@ def slope_response(
         distances from ``-(n - 1)`` to ``n - 1`` samples along y and x; none by default.
     nonuniform
         Further phases with position-dependent variance; requires ``structure``.
+    pairs
+        Structure function of all pairs of lit samples ``(k, k)`` in rad^2, for phases that are not
+        stationary; in place of ``structure``.
     interpolation
         Matrix ``(n, m)`` from the phase at nodes to the phase at samples, along either axis; by
         default the nodes are the samples.
@@ -228,8 +286,10 @@ def slope_response(
     if first_samples.min() < 0 or first_samples.max() + samples > n_grid:
         raise ValueError("the pupil images leave the periodic grid; enlarge the camera region")
     kernel = _prism_kernel(prism, len(light), n_grid)
-    correlations: list[ModulatedCorrelations] | list[TurbulentCorrelations]
-    if structure is None:
+    correlations: Sequence[_Correlations]
+    if pairs is not None:
+        correlations = [PairwiseCorrelations(light, kernel, prism.diameter, modulation, pairs)] * _WORKERS
+    elif structure is None:
         correlations = [ModulatedCorrelations(light, prism, n_grid, modulation)] * _WORKERS
     else:
         terms = _coherence_terms(len(light), prism.diameter, modulation, structure, nonuniform)
@@ -289,7 +349,7 @@ class _ResponseSums:
 
     def add(
         self,
-        pixel_correlations: ModulatedCorrelations | TurbulentCorrelations,
+        pixel_correlations: _Correlations,
         pixels: NDArray[np.intp],
         worker: int,
     ) -> None:
@@ -297,21 +357,32 @@ class _ResponseSums:
         n, s = len(self._light), self._samples
         inner = np.stack(np.divmod(np.arange(s * s), s), axis=1)
         sums = np.zeros((3, n, n), np.float32)
-        for k in pixels:
-            sums[: 3 if self._local else 2] = 0
-            at = (self._first_samples[:, k, None] + inner).reshape(-1, 2)
-            for i, correlations in enumerate(pixel_correlations.correlations(at)):
-                row, column = at[i] + (n - 1)
-                signs = _SIGNS[i // (s * s)]
-                power = _add_pixel_response(
-                    self._kernel, row, column, self._light, correlations, self._spans, signs, sums
-                )
-                self._power[:, k] += signs[0] * power, signs[1] * power, power
-            self._derivatives[:, k] = self._to_nodes(sums[:2])
-            if self._local:
-                self._total[k] = self._to_nodes(sums[2])
+        for block in np.array_split(pixels, max(1, len(pixels) // _BLOCK)):
+            at = np.moveaxis(self._first_samples[:, block, None] + inner, 0, 1).reshape(len(block), -1, 2)
+            correlations = pixel_correlations.correlations(at.reshape(-1, 2))
+            for k, positions in zip(block, at + (n - 1), strict=True):
+                self._add_pixel(k, positions, correlations, sums)
         if not self._local:
             self._total[worker] = self._to_nodes(sums[2])
+
+    def _add_pixel(
+        self,
+        k: int,
+        positions: NDArray[np.intp],
+        correlations: Iterator[NDArray[np.complex64]],
+        sums: NDArray[np.float32],
+    ) -> None:
+        """Compute the sums of pixel ``k`` from the next correlations, those at ``positions (4 s^2, 2)``."""
+        sums[: 3 if self._local else 2] = 0
+        for i, (row, column) in enumerate(positions):
+            signs = _SIGNS[i // self._samples**2]
+            power = _add_pixel_response(
+                self._kernel, row, column, self._light, next(correlations), self._spans, signs, sums
+            )
+            self._power[:, k] += signs[0] * power, signs[1] * power, power
+        self._derivatives[:, k] = self._to_nodes(sums[:2])
+        if self._local:
+            self._total[k] = self._to_nodes(sums[2])
 
     def normalise(self) -> SlopeResponse:
         """Slopes and their derivatives; works in place."""

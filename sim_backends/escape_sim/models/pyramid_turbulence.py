@@ -75,10 +75,21 @@ class PokePhase:
         squares = np.sum([np.square(np.gradient(mode)).sum(axis=0) for mode in self.modes_rad], axis=0)
         return NonuniformPhase(self.structure(), np.where(self.lit, squares / squares[self.lit].mean(), 1.0))
 
+    def pair_structure(self) -> NDArray[np.float32]:
+        """Structure function of all pairs of lit samples ``(k, k)`` in rad^2."""
+        inside = self.modes_rad[:, self.lit].astype(np.float32)
+        return _structure_of(inside.T @ inside)
+
     def phases(self, count: int) -> NDArray[np.float64]:
         """Random phases ``(count, n, n)`` in radians, from a fixed seed."""
         draws = np.random.default_rng(1).standard_normal((count, len(self.modes_rad)))
         return np.asarray(np.tensordot(draws, self.modes_rad, 1))
+
+
+def _structure_of(covariance: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Structure function of all pairs ``(k, k)`` of phases with a covariance."""
+    variance = np.diag(covariance)
+    return np.asarray(variance[:, None] + variance - 2 * covariance)
 
 
 def _mean_structure(modes_rad: NDArray[np.float64], lit: NDArray[np.bool_]) -> NDArray[np.float64]:
@@ -124,8 +135,13 @@ class Turbulence:
         modes: NDArray[np.float64] | None = None,
     ) -> None:
         self._outer_scale, self._distances, self._lit = outer_scale, distances, lit
-        self._uncorrected = unit_screens(lit.shape[0], outer_scale)
-        self._corrected = self._uncorrected if modes is None else _remove(modes, self._uncorrected, lit)
+        self._uncorrected = self._corrected = unit_screens(lit.shape[0], outer_scale)
+        self._basis: NDArray[np.float64] | None = None
+        if modes is not None:
+            columns = np.vstack([modes[:, lit], np.ones(np.count_nonzero(lit))]).T
+            # Orthonormal modes and piston over the lit samples ``(k, n_modes + 1)``.
+            self._basis = np.linalg.qr(columns)[0]
+            self._corrected = _remove(self._basis, self._uncorrected, lit)
         #: Fraction of the amplitude of the corrected modes that is left; 1 in open loop.
         self.left = 1.0 if modes is None else 0.0
 
@@ -135,54 +151,83 @@ class Turbulence:
         return np.asarray(strength ** (5 / 6) * (self._corrected + self.left * change))
 
     def structure(self, strength: float) -> NDArray[np.float64]:
-        """Structure function in rad^2 ``(2 n - 1, 2 n - 1)``, by the separation of two samples."""
-        whole = structure_function(self._distances, 1 / strength, self._outer_scale)
-        if self.left == 1:
-            return whole
-        states = self._corrected * (strength ** (5 / 6) / np.sqrt(len(self._corrected)))
-        return np.asarray(self.left**2 * whole + (1 - self.left**2) * _mean_structure(states, self._lit))
+        """Structure function in rad^2 in open loop ``(2 n - 1, 2 n - 1)``, by the separation of samples."""
+        return structure_function(self._distances, 1 / strength, self._outer_scale)
+
+    def pair_structure(self, strength: float) -> NDArray[np.float32] | None:
+        """Structure function of all pairs of lit samples ``(k, k)`` in rad^2; ``None`` in open loop.
+
+        What the modes leave is not stationary: it differs between pairs of samples at equal distance. With
+        the mean over all pairs of a distance in their place, the scalings of a registration are biased.
+        """
+        if self._basis is None:
+            return None
+        rows, columns = np.nonzero(self._lit)
+        last = len(self._lit) - 1
+        between = self.structure(strength)[
+            rows[:, None] - rows + last, columns[:, None] - columns + last
+        ].astype(np.float32)
+        # Up to piston, which the loop removes or which does not matter.
+        covariance, basis = between * np.float32(-0.5), self._basis.astype(np.float32)
+        removed = np.float32(1 - self.left)
+        covariance -= removed * (basis @ (basis.T @ covariance))
+        covariance -= removed * ((covariance @ basis) @ basis.T)
+        return _structure_of(covariance)
 
     def estimate_left(
         self, optics: PyramidOptics, pupils: PyramidPupils, strength: float, pokes: PokePhase | None
-    ) -> None:
-        """Set :attr:`left` from the tilt of the slopes, which a loop corrects with the other modes.
+    ) -> NDArray[np.float64]:
+        """Set :attr:`left` from the tilt of the slopes, and find the mean tilt at which the loop stands.
 
-        The slopes' mean over the pupil gives the tilt that is left, by the response to a small tilt on the
-        corrected turbulence; pokes are part of it. The tilt without a loop is that of the structure function.
+        A loop corrects the tilt with the other modes. The slopes' mean over the pupil gives the tilt that is
+        left, by the response to a small tilt on the corrected turbulence; pokes are part of it. The tilt
+        without a loop is that of the structure function. On average the loop holds the slopes at the
+        references, whose mean a flat wavefront need not have: it has another one where the four images are
+        not on a square, because the faces then meet in ridges.
+
+        Returns
+        -------
+        numpy.ndarray
+            Mean tilt ``(2,)`` of the wavefront along x and y, waves per sample.
         """
         whole = structure_function(self._distances, 1 / strength, self._outer_scale)
         states = self._corrected * strength ** (5 / 6)
-        ratios = []
-        for axis, tilt in enumerate(_unit_tilts(self._lit)):
+        tilts, radians_per_sample = _unit_tilts(self._lit)
+        responses, ratios, means = np.empty((2, 2)), [], np.zeros(2)
+        for axis, tilt in enumerate(tilts):
             step = _TILT_RAD * tilt
             up, down = (
-                np.array([_mean_slopes(optics, pupils, state + change)[axis] for state in states])
+                np.array([_mean_slopes(optics, pupils, state + change) for state in states])
                 for change in (step, -step)
             )
-            response = (up - down).mean() / (2 * _TILT_RAD)
+            responses[:, axis] = (up - down).mean(axis=0) / (2 * _TILT_RAD)
+            means += (up + down).mean(axis=0) / 4
             # Other modes have a mean slope as well.
-            others = ((up + down) / 2).var(ddof=1)
-            variance = (pupils.residual_tilt**2 - others) / response**2
+            others = ((up + down) / 2)[:, axis].var(ddof=1)
+            variance = (pupils.residual_tilt**2 - others) / responses[axis, axis] ** 2
             if pokes is not None:
                 variance -= np.square((pokes.modes_rad * tilt)[:, self._lit].mean(axis=1)).sum()
             ratios.append(max(variance, 0.0) / _projected_variance(tilt / np.count_nonzero(self._lit), whole))
         self.left = min(float(np.sqrt(np.mean(ratios))), 1.0)
+        return np.asarray(np.linalg.solve(responses, -means) * radians_per_sample / (2 * np.pi))
 
 
-def _unit_tilts(lit: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Tilts along x and y ``(2, n, n)`` of rms 1 and mean 0 over the lit samples; 0 elsewhere."""
+def _unit_tilts(lit: NDArray[np.bool_]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Tilts along x and y ``(2, n, n)`` of rms 1 and mean 0 over the lit samples, and their slopes ``(2,)``.
+
+    The tilts are 0 elsewhere; the slopes are per sample.
+    """
     tilts = np.where(lit, np.indices(lit.shape)[::-1].astype(float), 0.0)
     tilts[:, lit] -= tilts[:, lit].mean(axis=1, keepdims=True)
-    tilts /= np.sqrt(np.square(tilts[:, lit]).mean(axis=1))[:, None, None]
-    return np.asarray(tilts)
+    slopes = 1 / np.sqrt(np.square(tilts[:, lit]).mean(axis=1))
+    return tilts * slopes[:, None, None], slopes
 
 
 def _remove(
-    modes: NDArray[np.float64], screens: NDArray[np.float64], lit: NDArray[np.bool_]
+    basis: NDArray[np.float64], screens: NDArray[np.float64], lit: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
-    """Screens ``(count, n, n)`` without piston and modes over the lit samples; 0 elsewhere."""
-    columns = np.vstack([modes[:, lit], np.ones(np.count_nonzero(lit))]).T
-    basis, inside, rest = np.linalg.qr(columns)[0], screens[:, lit], np.zeros_like(screens)
+    """Screens ``(count, n, n)`` without orthonormal modes ``(k, n_modes)`` of lit samples; 0 elsewhere."""
+    inside, rest = screens[:, lit], np.zeros_like(screens)
     rest[:, lit] = inside - (inside @ basis) @ basis.T
     return rest
 
