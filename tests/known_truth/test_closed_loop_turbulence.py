@@ -89,7 +89,9 @@ def test_the_structure_of_pairs_is_that_of_what_modes_leave() -> None:
     pairs = rng.integers(len(rows), size=(2, 500))
     want = np.mean(np.square(states[pairs[0]] - states[pairs[1]]), axis=1)
     assert found[tuple(pairs)] == pytest.approx(want, rel=0.12, abs=1e-3)
-    assert Turbulence(4.0, sample_distances(n, 1 / n), lit).pair_structure(STRENGTH) is None
+    opened = Turbulence(4.0, sample_distances(n, 1 / n), lit)
+    assert (opened.stationary, turbulence.stationary) == (True, False)
+    assert opened.pair_structure(STRENGTH) == pytest.approx(200 - 2 * covariance, rel=1e-5, abs=1e-4)
 
 
 def test_a_loop_that_stands_at_a_tilt_is_found(loop: Loop) -> None:

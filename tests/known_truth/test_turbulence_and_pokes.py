@@ -37,12 +37,11 @@ def test_pokes_have_the_structure_function_of_their_phases(pupils: PyramidPupils
     inside = phases[:, lit]
     rms = np.sqrt(pokes.modes_rad[:, lit].var(axis=1).sum())
     assert np.sqrt(inside.var(axis=1).mean()) == pytest.approx(rms, rel=0.05)
-    structure, n = pokes.structure(), lit.shape[0]
-    assert structure[n - 1, n - 1] == pytest.approx(0, abs=1e-9 * structure.max())
-    for apart in (2, 5, 10):
-        both = lit[:, apart:] & lit[:, :-apart]
-        seen = np.square(phases[:, :, apart:] - phases[:, :, :-apart])[:, both].mean()
-        assert seen == pytest.approx(structure[n - 1, n - 1 + apart], rel=0.1)
+    structure, pairs = pokes.pair_structure(), np.random.default_rng(3).integers(lit.sum(), size=(2, 400))
+    assert np.abs(np.diag(structure)).max() < 1e-5 * structure.max()
+    seen = np.square(inside[:, pairs[0]] - inside[:, pairs[1]]).mean(axis=0)
+    assert seen.mean() == pytest.approx(structure[tuple(pairs)].mean(), rel=0.02)
+    assert seen == pytest.approx(structure[tuple(pairs)], rel=0.3)
 
 
 def test_pokes_are_shared_among_modes_as_far_as_their_actuators_go() -> None:
@@ -80,10 +79,8 @@ def test_the_mean_response_beside_pokes_is_that_of_frames(pupils: PyramidPupils)
         seen.append((up - down) / (2 * step))
     mean = np.mean(seen, axis=0)
     noise = np.std(seen, axis=0).mean() / np.sqrt(len(seen))
-    # The mean is computed from the second moments of the pokes' phases. With the pointed influence functions
-    # of this mirror 12 % remain, and a gain of 0.963 from 600 states; with Gaussian ones 7 % and 0.980.
-    assert np.sqrt(np.mean(np.square(mean - want))) < 0.1 * np.std(want) + 1.5 * noise
-    assert np.vdot(mean, want) / np.vdot(want, want) == pytest.approx(1.0, abs=0.05)
+    assert np.sqrt(np.mean(np.square(mean - want))) < 0.02 * np.std(want) + 1.5 * noise
+    assert np.vdot(mean, want) / np.vdot(want, want) == pytest.approx(1.0, abs=0.015)
 
 
 @pytest.mark.slow
@@ -105,12 +102,11 @@ def test_pokes_that_move_the_rim_more_make_no_difference_between_modes(pupils: P
     seen = np.linalg.lstsq(commands - commands.mean(axis=0), slopes - slopes.mean(axis=0))[0].T
     want, derivatives = model.modal_jacobian(Registration(), m2c)
     gains = np.vdot(seen, want) / np.vdot(want, want), (seen * want).sum(axis=0) / np.square(want).sum(axis=0)
-    assert gains[0] == pytest.approx(1.0, abs=0.05)
-    assert gains[1].std() < 0.06
+    assert gains[0] == pytest.approx(1.0, abs=0.015)
+    assert gains[1].std() < 0.015
     terms = np.concatenate([want[None], derivatives]).reshape(len(derivatives) + 1, -1)
     gain, *moved = np.linalg.lstsq(terms @ terms.T, terms @ seen.ravel())[0]
-    # Strong pokes, most of all at the rim: 0.7 %, however many frames.
-    assert np.abs(np.array(moved[3:5]) / gain).max() < 1.0
+    assert np.abs(np.array(moved[3:5]) / gain).max() < 0.3
 
 
 @pytest.mark.parametrize(

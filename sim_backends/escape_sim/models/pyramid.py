@@ -355,25 +355,26 @@ class PyramidModel(DesignModel):
         shape = self._config.devices.wfs.region[:1:-1]
         grid = next_fast_length(max(shape), samples)
         region = GridRegion(pupils.centres_px, shape, grid, samples)
-        structure, nonuniform, pairs = None, None, self._pair_structure()
-        if pairs is None and (self.turbulence or self._pokes):
-            structure = np.zeros((2 * n - 1, 2 * n - 1))
-            if self.turbulence:
-                structure = self._phases.structure(self.turbulence)
-            nonuniform = None if self._pokes is None else self._pokes.nonuniform()
+        structure, pairs = None, self._pair_structure()
+        if pairs is None and self.turbulence:
+            structure = self._phases.structure(self.turbulence)
         return slope_response(
             pupil.amplitude, Prism(region.shifts(n), pupil.n_sub * samples), grid * samples,
-            pupils.corners_px - region.first, pupils.valid, self._modulation, structure,
-            nonuniform=nonuniform, pairs=pairs,
+            pupils.corners_px - region.first, pupils.valid, self._modulation, structure, pairs=pairs,
             interpolation=self._interpolation, samples=samples, local=pupils.normalisation == "local",
         ).phase_derivatives  # fmt: skip
 
     def _pair_structure(self) -> NDArray[np.float32] | None:
-        """Structure function of all pairs of lit samples in closed loop, with pokes; else ``None``."""
-        pairs = self._phases.pair_structure(self.turbulence) if self.turbulence else None
-        if pairs is not None and self._pokes is not None:
-            pairs += self._pokes.pair_structure()
-        return pairs
+        """Structure function of all pairs of lit samples; ``None`` where the phase is stationary.
+
+        Pokes are not: modes of high order are strong at the rim of a mirror. Nor is what a loop leaves.
+        """
+        turbulent = self.turbulence > 0
+        if self._pokes is None:
+            still = not turbulent or self._phases.stationary
+            return None if still else self._phases.pair_structure(self.turbulence)
+        pairs = self._pokes.pair_structure()
+        return pairs + self._phases.pair_structure(self.turbulence) if turbulent else pairs
 
     def optics(self) -> PyramidOptics:
         """Optics of the design's sensor, with the images at their measured positions."""

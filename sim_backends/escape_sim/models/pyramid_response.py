@@ -59,40 +59,24 @@ class ModulatedCorrelations:
 
 
 class TurbulentCorrelations:
-    """Correlations of a modulation under turbulence: one convolution with the coherence per pixel.
+    """Correlations of a modulation under stationary turbulence: one convolution with the coherence per pixel.
 
     ``light`` is the pupil amplitude ``(n, n)``, ``kernel`` the point response from :func:`_prism_kernel`,
-    ``mean`` the :func:`coherence`. For phases that vary more in parts of the pupil, ``half_share (n, n)`` is
-    half the weight of ``difference``, which is added to the coherence there. Not thread-safe.
+    ``mean`` the :func:`coherence`. Not thread-safe.
     """
 
     def __init__(
-        self,
-        light: NDArray[np.float32],
-        kernel: NDArray[np.complex64],
-        mean: NDArray[np.complex128],
-        half_share: NDArray[np.float32] | None = None,
-        difference: NDArray[np.complex128] | None = None,
+        self, light: NDArray[np.float32], kernel: NDArray[np.complex64], mean: NDArray[np.complex128]
     ) -> None:
         self._filter = _convolution(mean, len(light))
-        self._light, self._kernel, self._half_share = light, kernel, half_share
-        self._difference_filter = None if difference is None else _convolution(difference, len(light))
+        self._light, self._kernel = light, kernel
 
     def correlations(self, pixels: NDArray[np.intp]) -> Iterator[NDArray[np.complex64]]:
         """Yield ``n`` rows of ``n`` or more samples for each (row, column) ``u`` in ``pixels``."""
-        n, filter_, difference = len(self._light), self._filter, self._difference_filter
+        n, filter_ = len(self._light), self._filter
         for row, column in pixels:
             _shifted_kernel(self._kernel, n - 1 + row, n - 1 + column, self._light, filter_.field)
             filter_.run()
-            if difference is not None and self._half_share is not None:
-                result = filter_.result[:n, :n]
-                # With s(p, q) = (s(p) + s(q)) / 2, half the share is on either side of the convolution.
-                difference.field[:n, :n] = filter_.field[:n, :n]
-                difference.run()
-                result += self._half_share * difference.result[:n, :n]
-                difference.field[:n, :n] *= self._half_share
-                difference.run()
-                result += difference.result[:n, :n]
             yield filter_.result
 
 
@@ -202,18 +186,6 @@ def _add_pixel_response(kernel, row, column, light, correlations, spans, weights
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class NonuniformPhase:
-    """Gaussian phases whose variance depends on the position in the pupil.
-
-    ``structure`` is their mean structure function ``(2 n - 1, 2 n - 1)`` in rad^2, ``strength (n, n)`` the
-    factor on it at each sample, 1 on average.
-    """
-
-    structure: NDArray[np.float64]
-    strength: NDArray[np.float64]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class SlopeResponse:
     """Slopes of a flat wavefront ``flat (n_slopes,)``, all x then all y, and their derivatives.
 
@@ -233,7 +205,6 @@ def slope_response(
     modulation: ModulationPath,
     structure: NDArray[np.float64] | None = None,
     *,
-    nonuniform: NonuniformPhase | None = None,
     pairs: NDArray[np.float32] | None = None,
     interpolation: NDArray[np.float32] | None = None,
     samples: int = 1,
@@ -263,8 +234,6 @@ def slope_response(
     structure
         Structure function ``(2 n - 1, 2 n - 1)`` in rad^2 of the turbulence to average over, at
         distances from ``-(n - 1)`` to ``n - 1`` samples along y and x; none by default.
-    nonuniform
-        Further phases with position-dependent variance; requires ``structure``.
     pairs
         Structure function of all pairs of lit samples ``(k, k)`` in rad^2, for phases that are not
         stationary; in place of ``structure``.
@@ -292,8 +261,8 @@ def slope_response(
     elif structure is None:
         correlations = [ModulatedCorrelations(light, prism, n_grid, modulation)] * _WORKERS
     else:
-        terms = _coherence_terms(len(light), prism.diameter, modulation, structure, nonuniform)
-        correlations = [TurbulentCorrelations(light, kernel, *terms) for _ in range(_WORKERS)]
+        mean = coherence(len(light), prism.diameter, modulation, structure)
+        correlations = [TurbulentCorrelations(light, kernel, mean) for _ in range(_WORKERS)]
     sums = _ResponseSums(kernel, light, first_samples, samples, interpolation, local)
     parts = np.array_split(np.arange(first_samples.shape[1]), _WORKERS)
     # Each worker multiplies matrices on its own thread.
@@ -301,27 +270,6 @@ def slope_response(
         for future in [pool.submit(sums.add, correlations[k], part, k) for k, part in enumerate(parts)]:
             future.result()
     return sums.normalise()
-
-
-def _coherence_terms(
-    n: int,
-    diameter: float,
-    modulation: ModulationPath,
-    structure: NDArray[np.float64],
-    nonuniform: NonuniformPhase | None,
-) -> tuple[NDArray[np.complex128], NDArray[np.float32] | None, NDArray[np.complex128] | None]:
-    """Coherence of the least varying quarter of the pupil, and what is added where phases vary more.
-
-    Between two samples the strength is the mean of both, and the coherence is taken as linear in it.
-    """
-    if nonuniform is None:
-        return coherence(n, diameter, modulation, structure), None, None
-    low, high = np.percentile(nonuniform.strength, (25, 75))
-    weak, strong = (
-        coherence(n, diameter, modulation, structure + level * nonuniform.structure) for level in (low, high)
-    )
-    half_share = (nonuniform.strength - low) / (2 * max(high - low, 1e-6))
-    return weak, half_share.astype(np.float32), strong - weak
 
 
 class _ResponseSums:

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from escape_hw.api.pyramid import PyramidPupils
 from escape_hw.pipeline.slopes.pyramid import slopes_of_image
 from escape_sim.atmosphere.von_karman import structure_function
-from escape_sim.models.pyramid_response import NonuniformPhase
 from escape_sim.optics.pyramid import PyramidOptics
 
 #: Trial strengths in pupil diameters over r0; beyond the last the slopes no longer distinguish them.
@@ -59,22 +58,6 @@ class PokePhase:
         amplitude *= rms / np.sqrt(np.square(amplitude).sum())
         return cls(amplitude[:, None, None] * modes_rad, lit)
 
-    def structure(self) -> NDArray[np.float64]:
-        """Structure function in rad^2 ``(2 n - 1, 2 n - 1)``, by the separation of two samples.
-
-        The mean over all pairs of lit samples with that separation; 0 if there are none.
-        """
-        return _mean_structure(self.modes_rad, self.lit)
-
-    def nonuniform(self) -> NonuniformPhase:
-        """Mean structure function, and its variation over the pupil.
-
-        High-order modes are strong at the rim of a mirror, so pokes move the phase more there than in
-        the centre. The local strength is the mean square slope of the phase.
-        """
-        squares = np.sum([np.square(np.gradient(mode)).sum(axis=0) for mode in self.modes_rad], axis=0)
-        return NonuniformPhase(self.structure(), np.where(self.lit, squares / squares[self.lit].mean(), 1.0))
-
     def pair_structure(self) -> NDArray[np.float32]:
         """Structure function of all pairs of lit samples ``(k, k)`` in rad^2."""
         inside = self.modes_rad[:, self.lit].astype(np.float32)
@@ -90,20 +73,6 @@ def _structure_of(covariance: NDArray[np.float32]) -> NDArray[np.float32]:
     """Structure function of all pairs ``(k, k)`` of phases with a covariance."""
     variance = np.diag(covariance)
     return np.asarray(variance[:, None] + variance - 2 * covariance)
-
-
-def _mean_structure(modes_rad: NDArray[np.float64], lit: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Structure function of independent modes ``(k, n, n)``, by the separation of two samples."""
-    n = lit.shape[0]
-    size = (2 * n, 2 * n)
-    weight = np.fft.rfft2(lit.astype(float), size)
-    squares = np.fft.rfft2(np.square(modes_rad).sum(axis=0) * lit, size)
-    pair = sum(np.square(np.abs(np.fft.rfft2(mode * lit, size))) for mode in modes_rad)
-    total = np.fft.irfft2(2 * (np.conj(squares) * weight).real - 2 * pair, size)
-    pairs = np.fft.irfft2(np.square(np.abs(weight)), size)
-    mean = np.where(pairs > 0.5, np.maximum(total, 0) / np.maximum(pairs, 1), 0.0)
-    steps = np.arange(1 - n, n)
-    return np.asarray(mean[np.ix_(steps, steps)])
 
 
 def sample_distances(n: int, pixel_m: float) -> NDArray[np.float64]:
@@ -145,6 +114,11 @@ class Turbulence:
         #: Fraction of the amplitude of the corrected modes that is left; 1 in open loop.
         self.left = 1.0 if modes is None else 0.0
 
+    @property
+    def stationary(self) -> bool:
+        """Whether the phase differs alike between all pairs of samples at equal distance: in open loop."""
+        return self._basis is None
+
     def phases(self, strength: float) -> NDArray[np.float64]:
         """Random phases ``(count, n, n)`` in radians, for a number of pupil diameters over r0."""
         change = self._uncorrected - self._corrected
@@ -154,19 +128,15 @@ class Turbulence:
         """Structure function in rad^2 in open loop ``(2 n - 1, 2 n - 1)``, by the separation of samples."""
         return structure_function(self._distances, 1 / strength, self._outer_scale)
 
-    def pair_structure(self, strength: float) -> NDArray[np.float32] | None:
-        """Structure function of all pairs of lit samples ``(k, k)`` in rad^2; ``None`` in open loop.
-
-        What the modes leave is not stationary: it differs between pairs of samples at equal distance. With
-        the mean over all pairs of a distance in their place, the scalings of a registration are biased.
-        """
-        if self._basis is None:
-            return None
+    def pair_structure(self, strength: float) -> NDArray[np.float32]:
+        """Structure function of all pairs of lit samples ``(k, k)`` in rad^2."""
         rows, columns = np.nonzero(self._lit)
         last = len(self._lit) - 1
-        between = self.structure(strength)[
-            rows[:, None] - rows + last, columns[:, None] - columns + last
-        ].astype(np.float32)
+        structure = self.structure(strength).astype(np.float32)
+        apart = rows[:, None] - rows + last, columns[:, None] - columns + last
+        between: NDArray[np.float32] = structure[apart]
+        if self._basis is None:
+            return between
         # Up to piston, which the loop removes or which does not matter.
         covariance, basis = between * np.float32(-0.5), self._basis.astype(np.float32)
         removed = np.float32(1 - self.left)
