@@ -15,7 +15,7 @@ from escape_hw.runtime.session.system import System
 #: Scripts that only print, if their raw table has all realisations.
 SCRIPTS = (
     "capture_range", "closed_loop_response", "constants", "lenslet_pokes", "neighbouring_spots", "nuisances",
-    "tracked_realisations",
+    "registration_errors", "tracked_realisations",
 )  # fmt: skip
 COMMAND = re.compile(
     rf"^python (benchmarks/studies/[a-z]+/(?:{'|'.join(SCRIPTS)})\.py .*--out docs/.*)$", re.MULTILINE
