@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 from escape_hw.config.bundled import bundled_systems
@@ -29,7 +30,7 @@ def _toml_files(incomplete: str) -> list[str]:
     folder, beginning = Path(incomplete or ".").parent, Path(incomplete).name
     if incomplete.endswith("/"):
         folder, beginning = Path(incomplete), ""
-    if not folder.is_dir():
+    if not folder.is_dir() or not os.access(folder, os.R_OK | os.X_OK):
         return []
     entries = (
         entry for entry in sorted(folder.iterdir())
