@@ -64,7 +64,8 @@ def run_realisation(system: str, number: int, frames: int, overrides: list[str],
         raise RuntimeError("the run ended before a registration was found")
     row = {
         "seed": config.system.seed, "commit": get_git_state(),
-        "converged": estimate.converged, "warnings": list(estimate.warnings), "chi2": estimate.chi2,
+        "converged": estimate.converged, "outcome": estimate.outcome, "model_fits": estimate.model_fits,
+        "warnings": list(estimate.warnings), "notes": list(estimate.notes), "chi2": estimate.chi2,
         "injected": injected.to_array().tolist(),
         "error": (estimate.registration.to_array() - injected.to_array()).tolist(),
         "sigma": estimate.sigma.tolist(), "gain": estimate.gain.value, "matrix_error": agreement,
@@ -98,7 +99,9 @@ def print_table(rows: list[Line]) -> None:
     """Print the statistics of the realisations that converged."""
     converged_rows = [row for row in rows if row["converged"]]
     suffix = "; statistics of the converged realisations:" if converged_rows else ""
-    print(f"{len(rows)} realisations, {len(converged_rows)} converged{suffix}")
+    unfit = sum(row.get("model_fits") is False for row in converged_rows)
+    flagged = f", {unfit} of which the model does not fit" if unfit else ""
+    print(f"{len(rows)} realisations, {len(converged_rows)} converged{flagged}{suffix}")
     if not converged_rows:
         return
     errors, sigmas = (np.array([row[key] for row in converged_rows]) for key in ("error", "sigma"))

@@ -18,14 +18,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from nuisances import measure as measure_imperfect
 from registration_errors import contamination_overrides, print_table, run_realisation
 
 from escape_benchmarks.realisation_tables import Line, each_realisation, read_lines, study_parser
 from escape_hw.api.registration import PARAMETERS
 from escape_hw.report.figures.style import SERIES, new_figure, style_axes
 
-#: Realisations of a case. No constant and no method was chosen on them.
-REALISATIONS = range(10000, 10020)
+#: Realisations of a case. No constant and no method was chosen on them, and none was looked at before.
+REALISATIONS = range(13000, 13020)
 #: The mirror of the bundled benches until version 0.2.0.
 GAUSSIAN = (
     "devices.dm.influence=gaussian", "devices.dm.coupling=0.4", "twin.mirror.shape=gaussian",
@@ -35,6 +36,8 @@ _THIN_PLATE = (
     "devices.dm.influence=gaussian", "devices.dm.coupling=0.4", "twin.mirror.shape=thin-plate",
     "twin.mirror.coupling=0.41", "twin.mirror.wing_fraction=0", "twin.mirror.gain_scatter=0.05",
 )  # fmt: skip
+#: A nominal mirror of another family than the true one.
+_GAUSSIAN_NOMINAL = ("devices.dm.influence=gaussian", "devices.dm.coupling=0.4")
 
 #: Sensors that are not built like the model.
 OOPAO = ("system.optics=oopao",)
@@ -44,7 +47,7 @@ OOPAO = ("system.optics=oopao",)
 class Case:
     """A system with a mirror and a number of frames.
 
-    ``title`` is its heading.
+    ``title`` is its heading; with ``imperfect`` all imperfections of the sensor are drawn (``nuisances.py``).
     """
 
     title: str
@@ -52,6 +55,13 @@ class Case:
     frames: int
     overrides: tuple[str, ...] = ()
     dm97: bool = False
+    imperfect: bool = False
+
+    def measure(self, number: int) -> Line:
+        """Calibrate a realisation."""
+        if self.imperfect:
+            return measure_imperfect(self.system, "all of them", number, self.frames)
+        return run_realisation(self.system, number, self.frames, list(self.overrides), self.dm97)
 
 
 CASES = {
@@ -60,6 +70,12 @@ CASES = {
     "gaussian-1000": Case("Gaussian influence functions, 1,000 frames", "razor-shwfs", 1000, GAUSSIAN),
     "gaussian-50": Case("Gaussian influence functions, 50 frames", "razor-shwfs", 50, GAUSSIAN),
     "thin-plate-1000": Case("thin plates, 1,000 frames", "razor-shwfs", 1000, _THIN_PLATE),
+    "nominal-1000": Case(
+        "mirrors like a DM97, a Gaussian nominal mirror, 1,000 frames", "razor-shwfs", 1000, _GAUSSIAN_NOMINAL
+    ),
+    "imperfect-1000": Case(
+        "as bundled, all imperfections of the sensor drawn, 1,000 frames", "razor-shwfs", 1000, imperfect=True
+    ),
     "dm97-1500": Case("mirrors like a DM97, 1,500 frames", "razor-pywfs", 1500, dm97=True),
     "oopao-1000": Case(
         "mirrors like a DM97, optics of OOPAO, 1,000 frames", "razor-shwfs", 1000, OOPAO, dm97=True
@@ -96,9 +112,15 @@ def measure(folder: Path, name: str) -> None:
     case = CASES[name]
     each_realisation(
         table_path(folder, name),
-        {"system": case.system, "frames": case.frames, "set": list(case.overrides), "dm97": case.dm97},
+        {
+            "system": case.system,
+            "frames": case.frames,
+            "set": list(case.overrides),
+            "dm97": case.dm97,
+            "imperfect": case.imperfect,
+        },
         REALISATIONS,
-        lambda number: run_realisation(case.system, number, case.frames, list(case.overrides), case.dm97),
+        case.measure,
         lambda row: f"{name} {np.round(row['error'], 3).tolist()}",
     )
 
