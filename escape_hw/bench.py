@@ -37,6 +37,7 @@ from escape_hw.config.registry import (
     call_factory,
     device_class,
     device_factory,
+    explain_missing_driver,
     model_factory,
 )
 from escape_hw.config.section import Section
@@ -119,7 +120,10 @@ class Bench:
         if dm is None or wfs is None:
             name, mode = ("dm", devices.dm.mode) if dm is None else ("wfs", devices.wfs.mode)
             key = "sim_driver" if (mode or config.system.mode) == "sim" else "driver"
-            raise ConfigError(f"devices.{name}.{key}: ''  names no driver; every system needs this device")
+            remedy = explain_missing_driver(DeformableMirror if dm is None else Camera)  # type: ignore[type-abstract]
+            raise ConfigError(
+                f"devices.{name}.{key}: ''  names no driver; every system needs this device: {remedy}"
+            )
         bench = cls(config, dm, wfs, science, screen, modulator)
         bench.dark = _read_pixels(devices.wfs, "dark_file")
         bench.flat = _read_pixels(devices.wfs, "flat_file")
@@ -265,7 +269,10 @@ def build_device(name: str, config: SystemConfig, kind: type[D]) -> D:
     """
     device = _build(name, getattr(config.devices, name, None), config, {}, kind)
     if device is None:
-        raise ConfigError(f"system '{config.system.name}' has no driver for devices.{name} in this mode")
+        raise ConfigError(
+            f"system '{config.system.name}' has no driver for devices.{name} in this mode; "
+            f"{explain_missing_driver(kind)}"
+        )
     return device
 
 

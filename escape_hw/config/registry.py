@@ -80,14 +80,26 @@ def call_factory(what: str, kind: type[T], factory: Callable[..., object], *argu
     return product
 
 
-def _suggest_drivers(kind: type[Device]) -> str:
-    """The drivers for real hardware that create devices of a class, for messages."""
+def drivers_of(kind: type[Device]) -> list[str]:
+    """The installed drivers that create devices of a class, for messages."""
     names = []
     for name in available(DEVICES):
         with contextlib.suppress(ConfigError):
             # A driver that is not completely installed, or part of a system only, is no way out.
             names += [name] if issubclass(device_class(name), kind) else []
+    return names
+
+
+def _suggest_drivers(kind: type[Device]) -> str:
+    names = drivers_of(kind)
     return f"; drivers that do: {', '.join(names)}" if names else ""
+
+
+def explain_missing_driver(kind: type[Device]) -> str:
+    """What a system without a driver for a device of this class needs, for messages."""
+    names = drivers_of(kind)
+    known = f" ({', '.join(names)})" if names else ""
+    return f"name one{known}"
 
 
 def _factory_name(factory: object) -> str:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from escape_hw.api.registration import PARAMETERS, UNITS
 from escape_hw.api.results import CalibrationResult, Estimate, RegistrationEstimate
+from escape_hw.config.layouts import shorten
 from escape_hw.errors import IncompatibleProduct
 from escape_hw.report.figures.matrix import representative_modes
 from escape_hw.report.tables import TITLES, Table, format_error, format_with_error
@@ -89,7 +90,11 @@ def compare(a: CalibrationResult, b: CalibrationResult) -> MatrixComparison:
             f"the matrices are of different sensors ({a.grid.kind}, {b.grid.kind}) and cannot be compared"
         )
     if a.matrix.m2c.shape != b.matrix.m2c.shape or not np.allclose(a.matrix.m2c, b.matrix.m2c, atol=1e-9):
-        raise IncompatibleProduct("the matrices have different modal bases; their modes cannot be compared")
+        layouts = [shorten(one.matrix.layout) for one in (a, b)]
+        actuators = f" and actuators at other places ({', '.join(layouts)})" if len({*layouts}) == 2 else ""
+        raise IncompatibleProduct(
+            f"the matrices have different modal bases{actuators}; their modes cannot be compared"
+        )
     if a.matrix.valid.shape != b.matrix.valid.shape:
         raise IncompatibleProduct(
             f"the grids differ: {a.matrix.valid.shape} and {b.matrix.valid.shape} {a.grid.elements}"

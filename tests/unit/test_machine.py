@@ -173,6 +173,14 @@ def test_doctor_finds_settings_that_a_driver_refuses(bench: Path) -> None:
         assert text in found.text
 
 
+def test_doctor_finds_a_sensor_without_a_driver(bench: Path) -> None:
+    found = levels(bench, load_system("maps-nir", overrides=["devices.wfs.mode=hardware"]))
+    assert found["devices.wfs.driver"].level == "error"
+    assert "milk-camera" in found["devices.wfs.driver"].remedy
+    assert "sim-" not in found["devices.wfs.driver"].remedy
+    assert "devices.wfs.driver" not in levels(bench, load_system("maps-nir"))
+
+
 def test_doctor_finds_the_way_to_the_mirror(bench: Path, tmp_path: Path) -> None:
     words = ["devices.dm.mode=hardware"]
     found = levels(bench, load_system("maps-nir", overrides=words))

@@ -123,3 +123,21 @@ def test_a_restart_forgets():
     again = line.update(np.array([9.0]), 0.01 * one, 0 * one)
     assert again.value[0] == 9.0
     assert again.rate[0] == 0.0
+
+
+def test_scatter_beyond_the_noise_is_no_jump_from_the_first_update_on():
+    # As on a pyramid, whose response varies with the wavefronts of a second.
+    rng = np.random.default_rng(12)
+    innovations = [
+        max(abs(one.innovation[0]) for one in follow(np.zeros(30), 6 * SIGMA * rng.standard_normal(30)))
+        for _ in range(100)
+    ]
+    assert max(innovations) < 8
+
+
+def test_a_jump_in_the_seventh_second_is_one():
+    rng = np.random.default_rng(4)
+    truth = np.zeros(10)
+    truth[6:] = 10.0
+    found = follow(truth, SIGMA * rng.standard_normal(10))
+    assert abs(found[6].innovation[0]) > 10

@@ -49,11 +49,11 @@ _MIN_WIDTH_SIGMA = 0.005
 _WHITEN_EVERY = 15
 #: Smallest number of whitened frames of an update.
 _MIN_FRAMES = 50
-#: Updates before the first innovation, and weight of an innovation in their running variance.
-_MIN_UPDATES, _LEARNING_RATE = 4, 0.15
+#: Innovations from which their running variance is learned before one is judged, and weight of a later one.
+_MIN_INNOVATIONS, _LEARNING_RATE = 4, 0.15
 #: Squared mean innovation, relative to the variance of its noise, above which it counts as curvature.
 _BIAS_THRESHOLD = 3.0
-#: Limit of a squared innovation in the running variance, so that a jump hardly changes it.
+#: Limit of a squared innovation over its running variance, so that a jump hardly changes that.
 _MAX_INNOVATION = 36.0
 
 
@@ -385,7 +385,7 @@ class SmoothedState:
         Covariance of the level ``(n, n)``, and its part that is independent from update to update.
     innovation
         Data of the last update minus their prediction ``(n,)``, in standard errors scaled to those of the
-        recent updates.
+        recent updates; zero while there are too few of them.
     """
 
     value: NDArray[np.float64]
@@ -413,7 +413,8 @@ class DoubleExponentialSmoother:
 
     def __init__(self, memory_s: float, max_rate: NDArray[np.float64]) -> None:
         self._memory_s, self._max_rate = memory_s, np.asarray(max_rate, float)
-        # Running variance of the innovations; survives a restart.
+        # Number and running variance of the innovations; survive a restart.
+        self._n_innovations = 0
         self._innovation_variance = np.ones(len(self._max_rate))
         self.restart()
 
@@ -468,16 +469,31 @@ class DoubleExponentialSmoother:
         raw_innovation, curvature_variance = self._compute_innovation(
             new_estimate, noise_of_a_second / seconds, seconds
         )
-        innovation = raw_innovation / np.sqrt(np.maximum(self._innovation_variance, 1.0))
-        self._innovation_variance += _LEARNING_RATE * (
-            np.minimum(np.square(raw_innovation), _MAX_INNOVATION) - self._innovation_variance
-        )
+        innovation = self._judge_innovation(raw_innovation)
         error_scale = np.sqrt(np.maximum(self._innovation_variance, 1.0))
         random_covariance = random_covariance * np.outer(error_scale, error_scale)
         random_covariance = random_covariance + np.diag(curvature_variance)
         self._last = value, rate, np.diag(random_covariance)
         self._trim()
         return SmoothedState(value, rate, static + random_covariance, random_covariance, innovation)
+
+    def _judge_innovation(self, raw_innovation: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Innovation in units of the scatter of recent ones, to which it is added.
+
+        Where the response varies with the wavefronts, as on a pyramid, estimates of single seconds scatter
+        more than the noise of the frames tells. How much is not known before there are a few of them.
+        """
+        if self._last is None:
+            return raw_innovation
+        variance = np.maximum(self._innovation_variance, 1.0)
+        judged = self._n_innovations >= _MIN_INNOVATIONS
+        limit = _MAX_INNOVATION * variance if judged else np.inf
+        self._n_innovations += 1
+        share = max(_LEARNING_RATE, 1 / (1 + self._n_innovations))
+        self._innovation_variance += share * (
+            np.minimum(np.square(raw_innovation), limit) - self._innovation_variance
+        )
+        return np.asarray(raw_innovation / np.sqrt(variance) if judged else np.zeros_like(raw_innovation))
 
     def _compute_innovation(
         self, new_estimate: NDArray[np.float64], covariance: NDArray[np.float64], seconds: float
@@ -488,7 +504,7 @@ class DoubleExponentialSmoother:
         running mean beyond its noise is added to the variance, and decays slowly, because an oscillation
         turns round.
         """
-        if self._last is None or len(self._first_shares) < _MIN_UPDATES:
+        if self._last is None:
             return np.zeros_like(new_estimate), np.zeros_like(new_estimate)
         value, rate, variance = self._last
         noise = np.diag(covariance) + variance

@@ -129,13 +129,12 @@ def load_matrix(
     product = MatrixProduct.read(path, KIND_MATRIX, _unpack)
     path, header, matrix = product.path, product.header, product.matrix
     system = None if expect_system is None else fits_file.header_text(expect_system)
-    remedy = f"basis.n_modes={matrix.n_modes} would take this one"
     for what, found, wanted, hint in (
         ("system", header["SYSTEM"], system, ""),
         ("kind of sensor", product.grid.kind, expect_sensor, ""),
         ("kind of basis", header["BASIS"], expect_basis, ""),
         ("number of actuators", matrix.m2c.shape[0], expect_actuators, ""),
-        ("number of modes", matrix.n_modes, expect_modes, remedy),
+        ("number of modes", matrix.n_modes, expect_modes, explain_modes(matrix.n_modes)),
         ("grid of sub-apertures", matrix.valid.shape, expect_sub_apertures, ""),
     ):
         fits_file.expect(path, what, found, wanted, hint)
@@ -144,6 +143,11 @@ def load_matrix(
     if matrix.simulated and not allow_simulated:
         raise IncompatibleProduct(f"{path}: made in simulation; it is not for hardware (--force overrides)")
     return product
+
+
+def explain_modes(found: int) -> str:
+    """With which setting a matrix of another number of modes would fit."""
+    return f"basis.n_modes={found} would take this one"
 
 
 def _pack_matrix(matrix: InteractionMatrix, prefix: str) -> list[Any]:

@@ -159,9 +159,10 @@ def _check_window() -> Iterator[Finding]:
 
 
 def _check_settings(config: SystemConfig | None) -> Iterator[Finding]:
-    """Whether the drivers accept the sections of the system's real devices; opens none."""
+    """Whether mirror and sensor have drivers, and all drivers accept their sections; opens no device."""
     if config is None:
         return
+    yield from _check_required_drivers(config)
     from escape_hw.api.device import Device
     from escape_hw.config.registry import DeviceContext, call_factory, device_factory
 
@@ -172,6 +173,19 @@ def _check_settings(config: SystemConfig | None) -> Iterator[Finding]:
             call_factory(f"devices.{name}", Device, factory, section, DeviceContext(name, config, shared))  # type: ignore[type-abstract]
         except EscapeError as error:
             yield Finding(f"devices.{name}", "error", str(error), "correct this section of the system file")
+
+
+def _check_required_drivers(config: SystemConfig) -> Iterator[Finding]:
+    from escape_hw.api.camera import Camera
+    from escape_hw.api.mirror import DeformableMirror
+    from escape_hw.bench import resolve_mode
+    from escape_hw.config.registry import explain_missing_driver
+
+    mirror, sensor = config.devices.dm, config.devices.wfs
+    for name, section, kind in (("dm", mirror, DeformableMirror), ("wfs", sensor, Camera)):
+        if resolve_mode(section, config) == "hardware" and not section.driver:
+            text = "is empty; every system needs this device"
+            yield Finding(f"devices.{name}.driver", "error", text, explain_missing_driver(kind))  # type: ignore[type-abstract]
 
 
 # --------------------------------------------------------------------- vendor libraries

@@ -31,6 +31,30 @@ def load_fitting_matrix(im: Path, config: SystemConfig, simulated: bool = False)
     ProductError, IncompatibleProduct
         The file is damaged or belongs to another system.
     """
+    from escape_hw.io.fits.file import expect
+    from escape_hw.io.fits.matrix import explain_modes
+
+    product = load_matrix_of_mirror(
+        im,
+        config,
+        expect_basis=config.basis.kind,
+        allow_simulated=simulated or config.system.mode == "sim",
+    )
+    found = product.matrix.n_modes
+    expect(product.path, "number of modes", found, config.basis.n_modes, explain_modes(found))
+    return product
+
+
+def load_matrix_of_mirror(im: Path, config: SystemConfig, **expected: Any) -> MatrixProduct:
+    """Read a matrix of this system, kind of sensor and layout of actuators.
+
+    The layout is judged before modes and sub-apertures: no setting of theirs would make another layout fit.
+
+    Raises
+    ------
+    ProductError, IncompatibleProduct
+        The file is damaged, belongs to another system, or is not as ``expected`` (:func:`load_matrix`).
+    """
     from escape_hw.config import layouts
     from escape_hw.io.fits.matrix import load_matrix
 
@@ -38,10 +62,8 @@ def load_fitting_matrix(im: Path, config: SystemConfig, simulated: bool = False)
         im,
         expect_system=config.system.name,
         expect_sensor=config.sensor.kind,
-        expect_basis=config.basis.kind,
-        expect_modes=config.basis.n_modes,
         expect_actuators=config.devices.dm.n_act,
-        allow_simulated=simulated or config.system.mode == "sim",
+        **expected,
     )
     layouts.require_same_positions(product.matrix.layout, config.devices.dm.layout, f"{product.path}:")
     return product

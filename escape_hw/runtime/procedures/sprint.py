@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 from escape_hw.config.choices import EXTRA_PARAMETERS, LOSSES, MODES_CHOICES, SOLVERS
 from escape_hw.runtime.procedures.declaration import ComputedProcedure, ProcedureSpec, SavedRun, parameter
+from escape_hw.runtime.procedures.matrix_input import load_matrix_of_mirror
 
 if TYPE_CHECKING:
     from escape_hw.api.procedure import Procedure
@@ -57,20 +58,12 @@ class SprintProcedure(ComputedProcedure["CalibrationResult"], SprintParameters["
 
     def load(self, config: SystemConfig, simulated: bool = False) -> None:
         """Read the matrix; number of modes, basis and mode may differ from the configuration."""
-        from escape_hw.config import layouts
-        from escape_hw.io.fits.matrix import load_matrix
+        from escape_hw.io.fits.file import expect
 
         self._config = config
-        self._product = load_matrix(
-            self.im,
-            expect_system=config.system.name,
-            expect_sensor=config.sensor.kind,
-            expect_actuators=config.devices.dm.n_act,
-            expect_sub_apertures=(config.sensor.n_sub, config.sensor.n_sub),
-        )
-        layouts.require_same_positions(
-            self._product.matrix.layout, config.devices.dm.layout, f"{self._product.path}:"
-        )
+        self._product = product = load_matrix_of_mirror(self.im, config)
+        wanted = (config.sensor.n_sub, config.sensor.n_sub)
+        expect(product.path, "grid of sub-apertures", product.matrix.valid.shape, wanted)
 
     def compute(self) -> Procedure[CalibrationResult]:
         """Estimate the registration; the matrix of the result is the measured one."""
