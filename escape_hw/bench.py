@@ -120,7 +120,7 @@ class Bench:
         if dm is None or wfs is None:
             name, mode = ("dm", devices.dm.mode) if dm is None else ("wfs", devices.wfs.mode)
             key = "sim_driver" if (mode or config.system.mode) == "sim" else "driver"
-            remedy = explain_missing_driver(DeformableMirror if dm is None else Camera)  # type: ignore[type-abstract]
+            remedy = explain_missing_driver(DeformableMirror if dm is None else Camera)
             raise ConfigError(
                 f"devices.{name}.{key}: ''  names no driver; every system needs this device: {remedy}"
             )

@@ -57,8 +57,10 @@ def format_calibration(result: CalibrationResult) -> list[str]:
     lines = [
         f"{matrix.method}: {matrix.n_modes} modes, {result.grid.n_valid} {result.grid.elements}, "
         f"{result.frames} frames ({seconds}), {result.lost_frames} lost",
-        f"signal-to-noise ratio per mode: minimum {snr.min():.3g}, median {sorted(snr)[len(snr) // 2]:.3g}",
     ]
+    if np.isfinite(snr).all():
+        median = sorted(snr)[len(snr) // 2]
+        lines.append(f"signal-to-noise ratio per mode: minimum {snr.min():.3g}, median {median:.3g}")
     if result.response is not None:
         lines.append(f"delay: {result.response.delay_frames:.2f} frames")
     return [*lines, *result.notes]

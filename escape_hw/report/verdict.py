@@ -82,6 +82,12 @@ def _problems(document: Mapping[str, Any]) -> Iterator[Verdict]:
             describe_outcome(True, False) + _describe_residual(document),
             "the notes name what does not fit, and the standard errors contain it",
         )
+    elif document.get("converged") and document.get("model_fits", True) is None and _has_no_noise(document):
+        yield Verdict(
+            Quality.USABLE,
+            "converged, but the matrix has no standard errors, so whether the model fits is not judged",
+            "state its noise if it is known (matrix.sigma of 'escape import arrays')",
+        )
     for criterion in _mappings(document.get("criteria")):
         text = str(criterion.get("text"))
         # Alarms are judged below.
@@ -98,6 +104,12 @@ def _problems(document: Mapping[str, Any]) -> Iterator[Verdict]:
     if alarms:
         many = f"{len(alarms)} alarms, the last" if len(alarms) > 1 else "an alarm"
         yield Verdict(Quality.USABLE, f"{many}: {alarms[-1].get('text', '')}", "see the report")
+
+
+def _has_no_noise(document: Mapping[str, Any]) -> bool:
+    """Whether the matrix is there without standard errors."""
+    snr = _mapping(document.get("snr"))
+    return "min" in snr and not _is_number(snr["min"])
 
 
 def _describe_residual(document: Mapping[str, Any]) -> str:

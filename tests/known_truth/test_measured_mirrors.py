@@ -52,6 +52,14 @@ def test_the_fit_of_a_measured_mirror_converges(date: str) -> None:
     assert left < 0.08
 
 
+def test_a_measured_mirror_without_standard_errors_gives_the_same() -> None:
+    matrix, fit = fitted(DATES[0])
+    other = fit_matrix(replace(matrix, sigma=np.zeros_like(matrix.sigma))).estimate
+    assert other.converged
+    difference = other.registration.to_array() - fit.estimate.registration.to_array()
+    assert np.abs(difference / fit.estimate.sigma).max() < 0.3
+
+
 def test_a_mask_that_reaches_beyond_the_described_lenslets_does_not_fit() -> None:
     """The largest mask on the camera's 29 lenslets across: those at the rim are dark in the model."""
     date, across = DATES[2], 29

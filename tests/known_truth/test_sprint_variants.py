@@ -105,6 +105,31 @@ def test_informative_modes_beat_the_first_ones(bench):
         choose_modes(matrix, 6, "d-optimal")
 
 
+@pytest.mark.parametrize("noise", [0.01, 0.1])
+def test_a_matrix_without_standard_errors_gives_the_same(bench, noise):
+    known = measured(bench, noise=noise, actuators=0.1, slopes=0.03)
+    unknown = replace(known, sigma=np.zeros_like(known.sigma))
+    one, other = (sprint(matrix, bench[0]) for matrix in (known, unknown))
+    assert other.converged
+    difference = other.registration.to_array() - one.registration.to_array()
+    assert np.abs(difference / one.sigma).max() < 0.3
+    assert other.sigma == pytest.approx(one.sigma, rel=0.5)
+    # In units of its residual.
+    assert other.chi2 == pytest.approx(1, abs=0.1)
+
+
+def test_without_standard_errors_the_largest_columns_are_chosen(bench):
+    model, valid, _ = bench
+    zonal = model.zonal_matrix(INJECTED).astype(np.float32)
+    matrix = InteractionMatrix(
+        zonal, np.zeros_like(zonal), np.eye(model.n_act), valid, "razor-shwfs", "push-pull", True
+    )
+    power = np.square(zonal).sum(axis=0)
+    chosen = choose_modes(matrix, 6)
+    assert chosen.tolist() == sorted(chosen)
+    assert power[chosen].min() >= np.delete(power, chosen).max()
+
+
 def test_an_iteration_of_small_steps_that_reached_its_limit_has_not_converged(bench):
     matrix = measured(bench, noise=0.3)
     cut = sprint(matrix, bench[0], learning_rate=0.01, coarse_search=False, max_iterations=3)

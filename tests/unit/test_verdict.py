@@ -27,6 +27,11 @@ ESCAPE = {"converged": True, "iterations": 15, "frames": 600, "snr": {"min": 23.
         ),
         ({"converged": False, "model_fits": False}, Quality.NOT_USABLE, "Not usable: not converged"),
         ({"model_fits": None}, Quality.GOOD, "Good: SNR 23.8"),
+        (
+            {"model_fits": None, "snr": {"min": None}},
+            Quality.USABLE,
+            "Usable: converged, but the matrix has no standard errors",
+        ),
         ({"converged": None, "snr": {"min": 0.35}}, Quality.NOT_USABLE, "SNR 0.35 in the worst mode"),
         ({"converged": None, "snr": {"min": 2.0}}, Quality.USABLE, "measure about 1,400 frames"),
         ({"criteria": [{"text": "loop stable", "met": False}]}, Quality.NOT_USABLE, "not met: loop stable"),

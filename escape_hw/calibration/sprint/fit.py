@@ -321,7 +321,7 @@ def _solve_with_updates(
     loss: Loss,
     state: MixedEffectsState | None,
 ) -> Procedure[tuple[WeightedMatrix, SprintSolution]]:
-    """Solve, then again with priors and outlier weights from the data; the last weights and solution."""
+    """Solve, then again with noise, priors and outlier weights from the data; last weights and solution."""
     solution = None
     if state is None:
         # The scatters need no exact solution, and with usual ones there may be none nearby.
@@ -329,6 +329,13 @@ def _solve_with_updates(
         start, state = solution.alpha, solution.state
     if context.use_pokes(start) or solution is None:
         solution = yield from solve(context, weighted, start, False, state)
+    if not weighted.has_standard_errors:
+        # Twice, because with the noise overstated the effects take up too little of the matrix.
+        for _ in range(2):
+            weighted, context.problem = weighted.in_units_of(solution.system.residual), None
+            solution = yield from solve(
+                context, weighted, solution.alpha, False, solution.state, rough=update_priors
+            )
     if update_priors and solution.estimate_priors is not None:
         context.priors = solution.estimate_priors().priors
         solution = yield from solve(context, weighted, solution.alpha, False, solution.state)

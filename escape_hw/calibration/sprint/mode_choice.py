@@ -32,7 +32,8 @@ def choose_modes(
         The measured matrix with its standard errors, and number of modes to choose.
     modes_choice
         ``"first"``: the first ones. ``"snr"``: those with the highest signal-to-noise ratio; on open-loop
-        data these are not the first, which contain most of the turbulence. ``"d-optimal"``: those that
+        data these are not the first, which contain most of the turbulence. Without standard errors those with
+        the largest slopes. ``"d-optimal"``: those that
         minimise the volume of the error ellipsoid of the registration; ``"a-optimal"``: the sum of its
         variances in units of the largest step (:func:`choose_by_fisher_information`).
     model, start
@@ -48,8 +49,10 @@ def choose_modes(
         return np.arange(n_modes)
     if modes_choice == "snr":
         snr = matrix.snr()
-        best = np.argsort(np.where(np.isfinite(snr), -snr, -np.inf), kind="stable")[:n_modes]
-        return np.sort(best)
+        if not np.isfinite(snr).all():
+            # Without standard errors the noise is taken as equal, as in the fit.
+            snr = np.square(matrix.data, dtype=float).mean(axis=0)
+        return np.sort(np.argsort(-snr, kind="stable")[:n_modes])
     if model is None:
         raise ValueError(f"modes_choice = '{modes_choice}' needs the derivatives of the model; pass model=")
     by_mode = mode_information(matrix, model, start or Registration())

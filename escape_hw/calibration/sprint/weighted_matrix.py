@@ -14,6 +14,8 @@ from escape_hw.api.synthetic_model import HasSlopeWeights, SyntheticModel
 _HUBER_THRESHOLD = 1.5
 #: Iterations of weighting and fitting; the weights hardly change after the second.
 HUBER_ITERATIONS = 3
+#: Least noise of a matrix without standard errors, relative to its rms: nothing is measured better.
+_LEAST_NOISE = 1e-3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -32,7 +34,8 @@ class WeightedMatrix:
     m2c
         Mode-to-command matrix of the columns ``(n_act, n_modes)``.
     has_standard_errors
-        Whether the matrix came with standard errors; if not, they are taken as equal.
+        Whether the matrix came with standard errors; if not, they are taken as equal: first as the rms of the
+        matrix, and then as that of the residual of a fit (:meth:`in_units_of`).
     valid
         Valid sub-apertures ``(n_rows, n_columns)``.
     slope_weights
@@ -77,6 +80,16 @@ class WeightedMatrix:
             self, data=self.data * root[:, None], by_slope=self.by_slope / root,
             slope_weights=self.slope_weights * weights,
         )  # fmt: skip
+
+    def in_units_of(self, residual: NDArray[np.float64]) -> WeightedMatrix:
+        """The same in units of the rms of a residual ``(n_slopes, n_modes)``; unchanged with standard errors.
+
+        The priors of a fit are relative to the noise: were it overstated, they would outweigh the matrix.
+        """
+        if self.has_standard_errors:
+            return self
+        level = max(self.noise_level(residual), _LEAST_NOISE * float(self.data.std()))
+        return replace(self, data=self.data / level, by_mode=self.by_mode * level)
 
     @property
     def modes(self) -> NDArray[np.float64]:

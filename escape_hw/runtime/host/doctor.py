@@ -185,7 +185,7 @@ def _check_required_drivers(config: SystemConfig) -> Iterator[Finding]:
     for name, section, kind in (("dm", mirror, DeformableMirror), ("wfs", sensor, Camera)):
         if resolve_mode(section, config) == "hardware" and not section.driver:
             text = "is empty; every system needs this device"
-            yield Finding(f"devices.{name}.driver", "error", text, explain_missing_driver(kind))  # type: ignore[type-abstract]
+            yield Finding(f"devices.{name}.driver", "error", text, explain_missing_driver(kind))
 
 
 # --------------------------------------------------------------------- vendor libraries
