@@ -262,7 +262,7 @@ class DeformableMirror(Device):
         try:
             guard = CommandGuard(self.name, info.n_act, self.limits, _pairs_of(info))
         except ValueError as error:
-            raise SettingRejected(self.name, f"its limits do not fit: {error}") from error
+            raise SettingRejected(self.name, f"its limits do not fit ({error})") from error
         if self.order is not None and not np.array_equal(np.sort(self.order), np.arange(info.n_act)):
             raise SettingRejected(
                 self.name,

@@ -111,7 +111,8 @@ class Reporter:
         now = time.monotonic()
         self._next = now + self.PERIOD_S
         elapsed = now - self._start
-        return Progress(self.stage, done, self.total, self.unit, elapsed, metrics, arrays or {})
+        # Some stages end later than expected, such as a search from several starts.
+        return Progress(self.stage, done, max(self.total, done), self.unit, elapsed, metrics, arrays or {})
 
 
 def run(

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import Any
+
+import typer
 
 from escape_hw.config.bundled import bundled_systems
 
@@ -13,16 +16,21 @@ def complete_system(incomplete: str) -> list[str]:
     return [name for name in bundled_systems() if name.startswith(incomplete)] + _toml_files(incomplete)
 
 
-def complete_driver(incomplete: str) -> list[str]:
-    """The installed drivers of real devices whose names begin with ``incomplete``."""
-    # The registry reads the entry points of all installed packages: only when asked for.
-    from escape_hw.config.registry import DEVICES, TWIN_PREFIX, available
+def complete_driver(ctx: typer.Context, incomplete: str) -> list[str]:
+    """The installed drivers of the devices that a group of commands is for."""
+    # Reads the entry points of all installed packages and imports the drivers: only when asked for.
+    from escape_hw.api.adaptive_secondary import AdaptiveSecondary
+    from escape_hw.api.camera import Camera
+    from escape_hw.api.device import Device
+    from escape_hw.api.mirror import DeformableMirror
+    from escape_hw.api.modulator import TipTiltModulator
+    from escape_hw.config.registry import drivers_of
 
-    return [
-        name
-        for name in available(DEVICES)
-        if name.startswith(incomplete) and not name.startswith(TWIN_PREFIX)
-    ]
+    kinds: dict[str | None, type[Any]] = {
+        "asm": AdaptiveSecondary, "camera": Camera, "dm": DeformableMirror, "modulator": TipTiltModulator,
+    }  # fmt: skip
+    group = None if ctx.parent is None else ctx.parent.info_name
+    return [name for name in drivers_of(kinds.get(group, Device)) if name.startswith(incomplete)]
 
 
 def _toml_files(incomplete: str) -> list[str]:

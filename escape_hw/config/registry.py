@@ -347,7 +347,6 @@ def _unknown_name_message(group: str, name: str, hardware: bool) -> str:
     if hardware:
         known = tuple(driver for driver in known if not driver.startswith(TWIN_PREFIX))
         kind, none = "driver for real hardware", "none, only twins"
-        install += ", or use the twin (--mode sim)"
     suggestion = closest_match(name, known)
     hint = f"did you mean '{suggestion}'? " if suggestion else ""
     return f"no {kind} '{name}' is installed ({hint}installed: {', '.join(known) or none}); {install}"

@@ -75,7 +75,10 @@ def _problems(document: Mapping[str, Any]) -> Iterator[Verdict]:
             "lower the gain, drop more modes, or calibrate again",
         )
     if document.get("converged") is False:
-        yield Verdict(Quality.NOT_USABLE, "not converged", "read the warnings, and measure more frames")
+        warnings = document.get("warnings")
+        why = str(warnings[0]) if isinstance(warnings, list | tuple) and warnings else ""
+        reason = f"not converged: {why}" if why else "not converged"
+        yield Verdict(Quality.NOT_USABLE, reason, "" if why else "measure more frames")
     elif document.get("model_fits") is False:
         yield Verdict(
             Quality.USABLE,

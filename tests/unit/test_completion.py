@@ -40,5 +40,8 @@ def test_a_path_is_continued_to_folders_and_toml_files(
 
 
 def test_drivers_of_real_devices_are_offered() -> None:
-    assert offered("escape dm flat --driver a") == ["alpao", "aravis", "asm"]
+    assert offered("escape dm flat --driver a") == ["alpao", "asm"]
+    assert offered("escape asm status --driver a") == ["asm"]
+    assert offered("escape camera snap --driver a") == ["aravis"]
+    assert offered("escape modulator start --driver ") == ["pi-e727"]
     assert offered("escape dm flat --driver sim") == []

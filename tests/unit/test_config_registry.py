@@ -246,7 +246,7 @@ def test_a_twin_is_never_offered_instead_of_a_driver() -> None:
         registry.device_factory("alpaka", hardware=True)
     assert "no driver for real hardware 'alpaka' is installed" in str(refused.value)
     assert "sim-" not in str(refused.value)
-    assert "--mode sim" in str(refused.value)
+    assert "--mode" not in str(refused.value), "a driver alone has no mode"
 
 
 @pytest.mark.usefixtures("plug")

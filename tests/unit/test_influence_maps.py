@@ -152,6 +152,7 @@ def test_positions_from_a_table_and_from_the_layout(tmp_path: Path) -> None:
         (1e-9 * truth(), MapSettings("nanometre", stroke_m=2e-6), "check devices.dm.influence_unit"),
         (truth(), MapSettings(pixel_m=0.2), "one pixel be 0.2 m"),
         (-truth(), MapSettings(), "reverse the sign of devices.dm.influence_poke"),
+        (0 * truth(), MapSettings(), "no values but zero and NaN"),
         (truth()[:5], MapSettings(), r"shape \(5, 77, 77\); influence functions of 37"),
         (truth(), MapSettings(positions="layout"), "needs devices.dm.influence_pixel_m"),
         (truth(), MapSettings(positions="none.txt"), "none.txt"),

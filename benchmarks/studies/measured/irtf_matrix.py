@@ -40,6 +40,8 @@ _MATRICES = ("imat.12x12.20250909a.npy", "imat.12x12.20250910a.npy")
 _ORIENTATIONS = tuple((t, x, y) for t in (False, True) for x in (False, True) for y in (False, True))
 #: Nodes per sub-aperture along an axis, and weights of Simpson's rule along an edge.
 _NODES, _EDGE = 2, np.array([1, 4, 1]) / 6
+#: Pixels by which the surfaces are continued beyond their grid.
+_RIM = 8
 
 
 class MeasuredModel:
@@ -58,7 +60,9 @@ class MeasuredModel:
 
     def __init__(self, surfaces: NDArray[np.float64], valid: NDArray[np.bool_]) -> None:
         self._surfaces, self._valid = surfaces, valid
-        self._mirror = MeasuredInfluenceFunctions(surfaces, N_SUB / surfaces.shape[1])
+        # The outer sub-apertures end half a pixel beyond the grid, and move; outside of it surfaces are zero.
+        wider = np.pad(surfaces, ((0, 0), (_RIM, _RIM), (_RIM, _RIM)), mode="edge")
+        self._mirror = MeasuredInfluenceFunctions(wider, N_SUB / surfaces.shape[1])
         self.n_act = len(surfaces)
         self._nodes = np.arange(_NODES * N_SUB + 1) / _NODES - N_SUB / 2
 

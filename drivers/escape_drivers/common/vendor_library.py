@@ -55,7 +55,7 @@ class LoadedLibrary:
         except OSError as error:
             raise DeviceError(
                 device,
-                f"the library of the {vendor.title} cannot be loaded ({error}); {vendor.source}, then "
+                f"{vendor.title} cannot be loaded ({error}); {vendor.source}, then "
                 f"name its file in the option 'library' of the device or in {vendor.variable}",
             ) from error
         missing = [name for name in self.PROTOTYPES if not hasattr(self.c, name)]

@@ -161,6 +161,7 @@ def solve(
     """
     model, solver, rate = context.model, context.solver, context.learning_rate
     n = context.max_iterations
+    context.report = Reporter("SPRINT", n, "iteration")
     if solver in MATRIX_ONLY_SOLVERS:
         low = low_mode_problem(context.matrix, model, context.columns, rate) if coarse_search else None
         if low is not None:

@@ -79,6 +79,11 @@ def select_device(
         raise ConfigError("--mode and --seed: not with --driver, which opens one real device")
     settings = _parse_settings(selection.set)
     if selection.serial:
+        if settings.get("serial", selection.serial) != selection.serial:
+            other = settings["serial"]
+            raise ConfigError(
+                f"--serial {selection.serial} contradicts --set serial={other}; give one of them"
+            )
         settings["serial"] = selection.serial
     serial = str(settings.get("serial", ""))
     context.set_device(selection.driver, serial)

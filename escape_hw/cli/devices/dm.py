@@ -12,7 +12,7 @@ import typer
 from escape_hw.cli import options
 from escape_hw.cli.command import command
 from escape_hw.cli.context import CommandContext
-from escape_hw.cli.devices.device_tools import DeviceCommand, SelectedDevice, select_device
+from escape_hw.cli.devices.device_tools import DeviceCommand, SelectedDevice, check_number, select_device
 from escape_hw.errors import CommandRejected, ConfigError
 
 if TYPE_CHECKING:
@@ -54,14 +54,16 @@ def poke(
     """Poke one actuator for a while: MOVES the mirror, flat before and after."""
     from escape_hw.runtime.host.device_tools import hold_shape, poke_shape
 
+    check_number("amplitude", amplitude, -1, 1, "of full stroke")
     chosen = _mirror(context, selection)
     dm = chosen.device
     _require_legal(chosen, lambda mirror: poke_shape(mirror, actuator, amplitude))
     chosen.announce_change(context, f"flat, then actuator {actuator} by {amplitude:g} for {seconds:g} s")
     _preserve_floating(dm)
     with context.open_protected(dm):
+        shape = poke_shape(dm, actuator, amplitude)
         dm.flatten()
-        motion = context.run(hold_shape(dm, poke_shape(dm, actuator, amplitude), seconds))
+        motion = context.run(hold_shape(dm, shape, seconds))
         info = dm.info
     asked = {"actuator": actuator, "amplitude": amplitude, "seconds": seconds}
     context.show(f"{info.model} {info.serial}: actuator {actuator} by {amplitude:g}, then flat")

@@ -185,7 +185,9 @@ def _read(file: str, n_act: int) -> _File:
             f"have the shape ({n_act}, n_y, n_x)"
         )
     cube[np.isinf(cube)] = np.nan
-    if (largest := float(np.nanmax(np.abs(cube), initial=0.0))) > _MAX_VALUE:
+    if not (largest := float(np.nanmax(np.abs(cube), initial=0.0))):
+        raise ConfigError(f"{path} has no values but zero and NaN; influence functions are heights")
+    if largest > _MAX_VALUE:
         raise ConfigError(
             f"{path} has values up to {largest:.3g}, which are no heights; set the pixels that were not "
             "measured to NaN"
