@@ -134,6 +134,19 @@ def test_y_slopes_before_x_slopes_are_named() -> None:
     assert "order of the slopes (matrix.slopes" in estimate.warnings[0], estimate.warnings
 
 
+@pytest.mark.parametrize(
+    ("signs", "named"), [((-1, 1), "x"), pytest.param((1, -1), "y", marks=pytest.mark.slow)]
+)
+def test_slopes_of_the_other_sign_are_named(signs: tuple[int, int], named: str) -> None:
+    matrix = measured(0)
+    reversed_slopes = np.concatenate(
+        [s * half for s, half in zip(signs, np.split(matrix.data, 2), strict=True)]
+    )
+    estimate = sprint(replace(matrix, data=reversed_slopes), MODEL)
+    assert not estimate.converged
+    assert f"(sensor.sign_{named} of" in estimate.warnings[0], estimate.warnings
+
+
 def test_no_clocking_is_named_where_the_fit_did_not_converge() -> None:
     matrix = measured(0)
     estimate = sprint(replace(matrix, data=-clocked(matrix.data).astype(np.float32)), MODEL)

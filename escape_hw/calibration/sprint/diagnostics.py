@@ -1,7 +1,7 @@
 """Diagnostics of a SPRINT fit.
 
 :func:`describe_degeneracies` names parameters that the data do not separate; :func:`check_orientation` tests
-flips, quarter turns, transposition and the order of the slopes for a matrix that no registration explains.
+flips, quarter turns, transposition, order and signs of the slopes for a matrix that no registration explains.
 """
 
 from __future__ import annotations
@@ -103,7 +103,7 @@ _ITERATIONS = 10
 def check_orientation(
     matrix: InteractionMatrix, model: SyntheticModel, columns: NDArray[np.intp]
 ) -> str | None:
-    """Find a flip, quarter turn, transposition or order of the slopes with which the model explains a matrix.
+    """Find a flip, quarter turn, transposition, order or sign of the slopes that explains a matrix.
 
     Returns
     -------
@@ -125,6 +125,13 @@ def check_orientation(
             "it would if its x slopes were its y slopes: check the order of the slopes (matrix.slopes of the "
             "description in 'escape import arrays')"
         )
+    gain = _gain_of_fit(_reverse_x_slopes(weighted), model)
+    if gain is not None:
+        axis = "x" if gain > 0 else "y"
+        return (
+            f"it would if its {axis} slopes had the other sign: check the sign of the slopes "
+            f"(sensor.sign_{axis} of the description in 'escape import arrays')"
+        )
     return None
 
 
@@ -141,6 +148,12 @@ def _exchange_slopes(weighted: WeightedMatrix) -> WeightedMatrix:
     return replace(
         weighted, data=np.roll(weighted.data, half, axis=0), by_slope=np.roll(weighted.by_slope, half)
     )
+
+
+def _reverse_x_slopes(weighted: WeightedMatrix) -> WeightedMatrix:
+    """The matrix with the opposite sign of its x slopes."""
+    half = len(weighted.data) // 2
+    return replace(weighted, data=np.concatenate([-weighted.data[:half], weighted.data[half:]]))
 
 
 def suggest_orientation(model: SyntheticModel, flip: Flip, *, opposite: bool = False) -> str:
