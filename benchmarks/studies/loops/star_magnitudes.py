@@ -33,6 +33,7 @@ from matplotlib.ticker import MultipleLocator
 
 from escape_benchmarks.realisation_tables import Line, each_realisation
 from escape_hw.errors import CalibrationError
+from escape_hw.io.provenance import get_git_state
 from escape_hw.io.run_folder import RunFolder
 from escape_hw.pipeline.statistics import MeanInterval, mean_interval
 from escape_hw.report.figures.style import INK, SERIES, legend, new_figure, style_axes
@@ -69,7 +70,8 @@ def measure_or_refuse(options: argparse.Namespace, number: int, until: float) ->
             return {**measure_seed(now, number, until), "refused": refused}
         except CalibrationError as error:
             refused = str(error)
-    return {"registrations": [], "strehl": {ESCAPE: 0.0, DOCRIME: 0.0}, "refused": refused}
+    strehl = {ESCAPE: 0.0, DOCRIME: 0.0}
+    return {"registrations": [], "strehl": strehl, "refused": refused, "commit": get_git_state()}
 
 
 def has_gains(row: Line) -> bool:
