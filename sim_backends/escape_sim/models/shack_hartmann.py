@@ -23,7 +23,7 @@ from escape_hw.pipeline.slopes.shack_hartmann import subaperture_windows
 from escape_sim.mirror.influence_functions import InfluenceFunctions
 from escape_sim.mirror.mode_surfaces import N_DERIVATIVES, GaussianFactors, mode_surfaces
 from escape_sim.models.base import DesignModel
-from escape_sim.optics.pupil import PupilGeometry, nominal_flux, pupil_geometry
+from escape_sim.optics.pupil import PupilGeometry, nominal_flux, pupil_from_lenslets
 from escape_sim.optics.shack_hartmann import field_pixels, first_pixels, lenslet_transform
 
 if TYPE_CHECKING:
@@ -510,7 +510,7 @@ class ShackHartmannModel(DesignModel):
         wavefronts_m: Sequence[NDArray[np.floating]] = (),
         overlap: float = 0.0,
     ) -> None:
-        super().__init__(config, pupil_geometry(config))
+        super().__init__(config, pupil_from_lenslets(config, grid))
         if grid.valid.shape != (self._pupil.n_sub, self._pupil.n_sub):
             raise ValueError(
                 f"the grid has {grid.valid.shape} lenslets, "

@@ -17,6 +17,7 @@ from escape_hw.pipeline.geometry.pupil_rims import RIM_SOFTNESS
 
 if TYPE_CHECKING:
     from escape_hw.api.pyramid import PyramidPupils
+    from escape_hw.api.sensor import SubApertureGrid
     from escape_hw.config.system import SystemConfig
     from escape_hw.config.twin import TwinContamination
 
@@ -73,6 +74,10 @@ PUPIL_SAMPLES = 8
 SAMPLES_PER_PITCH = 2.0
 #: Pixels of the rim with less than this share of the largest design flux do not measure transmission.
 _MIN_RIM_LIGHT = 0.4
+#: Least number of fully lit lenslets whose light shows the beam.
+_MIN_LENSLETS = 20
+#: Rounds of the fit to their light, and deviation in units of the median one above which one is left out.
+_OUTLIER_ROUNDS, _OUTLIER = 4, 5.0
 #: Smallest transmission of a sample that the design illuminates; it stays lit.
 _MIN_TRANSMISSION = 1e-3
 
@@ -193,6 +198,49 @@ def apply_measured_illumination(pupil: PupilGeometry, pupils: PyramidPupils) -> 
     )
     amplitude = pupil.amplitude * np.sqrt(np.maximum(relative_transmission, _MIN_TRANSMISSION))
     return replace(pupil, amplitude=amplitude.astype(np.float32))
+
+
+def pupil_from_lenslets(config: SystemConfig, grid: SubApertureGrid) -> PupilGeometry:
+    """Pupil with the beam that the light of the lenslets shows; the nominal one where that is not known.
+
+    Where a lenslet is brighter on one side, its slope is that of a place on that side. A beam that is
+    narrower than described hence moves the scalings of a registration, and one off centre the shifts. The
+    logarithm of measured over nominal light is fitted by a polynomial of second degree, which is exact for
+    Gaussian beams of any width and place.
+    """
+    pupil = pupil_geometry(config)
+    n, p = pupil.n_sub, pupil.n_pix
+    if not grid.counts or grid.flux.shape != (n, n):
+        return pupil
+    expected = np.square(pupil.amplitude, dtype=float).reshape(n, p, n, p).sum(axis=(1, 3))
+    whole = pupil.lit.reshape(n, p, n, p).all(axis=(1, 3))
+    usable = whole & grid.valid & (grid.flux > 0)
+    if usable.sum() < _MIN_LENSLETS:
+        return pupil
+    centres = (np.arange(n) - (n - 1) / 2) / (n / 2)
+    y, x = (centres[k] for k in np.nonzero(usable))
+    ratio = np.log(grid.flux[usable] / expected[usable])
+    coefficients = _fit_without_outliers(_quadratic(x, y), ratio)
+    u = pupil.coordinates_m / (n * pupil.sub_aperture_m / 2)
+    relative = np.tensordot(coefficients[1:], _quadratic(*np.meshgrid(u, u))[1:], axes=1)
+    amplitude = pupil.amplitude * np.exp(relative / 2)
+    return replace(pupil, amplitude=(amplitude / amplitude.max()).astype(np.float32))
+
+
+def _quadratic(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Monomials to the second degree ``(6, ...)``, the constant first."""
+    return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y])
+
+
+def _fit_without_outliers(basis: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Coefficients ``(k,)`` of ``basis (k, n)`` for ``values (n,)``, without dirty or broken lenslets."""
+    used = np.ones(values.size, bool)
+    coefficients = np.zeros(len(basis))
+    for _ in range(_OUTLIER_ROUNDS):
+        coefficients = np.linalg.lstsq(basis[:, used].T, values[used])[0]
+        away = np.abs(values - coefficients @ basis)
+        used = away <= _OUTLIER * max(float(np.median(away)), 1e-12)
+    return np.asarray(coefficients)
 
 
 def default_samples(config: SystemConfig) -> int:
