@@ -296,6 +296,8 @@ def build_standalone_device(driver: str, kind: type[D], /, **settings: Any) -> D
         The driver is unknown, not installed, of another class, works as a part of a system only, or does not
         take these settings.
     """
+    if not isinstance(driver, str):
+        raise ConfigError(f"driver is {driver!r}; it must be the name of one, such as 'alpao'")
     driver_class = device_class(driver, kind)
     _require_arguments(driver, driver_class, settings)
     if issubclass(driver_class, DeformableMirror) and settings.get("limits") is not None:
@@ -319,8 +321,11 @@ def _orientation_section(driver_class: type[Device]) -> type[Section]:
 
 
 def _require_arguments(driver: str, driver_class: type[Device], settings: Mapping[str, Any]) -> None:
-    """Refuse settings without a keyword that the driver needs."""
+    """Refuse settings without a keyword that the driver needs, and what is no text where one is needed."""
     for name, parameter in inspect.signature(driver_class).parameters.items():
+        value = settings.get(name, "")
+        if parameter.annotation in (str, "str") and not isinstance(value, str):
+            raise ConfigError(f"{driver}.{name}: {value!r}  must be a string")
         is_needed = parameter.default is parameter.empty and parameter.kind not in (
             parameter.VAR_POSITIONAL,
             parameter.VAR_KEYWORD,

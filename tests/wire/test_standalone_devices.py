@@ -300,6 +300,10 @@ def test_a_device_is_opened_by_the_name_of_its_driver() -> None:
             escape_hw.open_device(driver)
     with pytest.raises(ConfigError, match="'sim-alpao' works as a part of a system only"):
         escape_hw.open_device("sim-alpao")
+    with pytest.raises(ConfigError, match=r"driver is None; it must be the name of one"):
+        escape_hw.open_device(None)
+    with pytest.raises(ConfigError, match=r"alpao\.layout: 5  must be a string"):
+        escape_hw.open_device("alpao", serial="BAX118", layout=5)
 
 
 def test_limits_of_a_device_used_alone_may_be_a_table() -> None:

@@ -18,7 +18,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from nuisances import measure as measure_imperfect
 from registration_errors import contamination_overrides, print_table, run_realisation
 
 from escape_benchmarks.realisation_tables import Line, each_realisation, read_lines, study_parser
@@ -47,7 +46,7 @@ OOPAO = ("system.optics=oopao",)
 class Case:
     """A system with a mirror and a number of frames.
 
-    ``title`` is its heading; with ``imperfect`` all imperfections of the sensor are drawn (``nuisances.py``).
+    ``title`` is its heading.
     """
 
     title: str
@@ -55,13 +54,6 @@ class Case:
     frames: int
     overrides: tuple[str, ...] = ()
     dm97: bool = False
-    imperfect: bool = False
-
-    def measure(self, number: int) -> Line:
-        """Calibrate a realisation."""
-        if self.imperfect:
-            return measure_imperfect(self.system, "all of them", number, self.frames)
-        return run_realisation(self.system, number, self.frames, list(self.overrides), self.dm97)
 
 
 CASES = {
@@ -72,9 +64,6 @@ CASES = {
     "thin-plate-1000": Case("thin plates, 1,000 frames", "razor-shwfs", 1000, _THIN_PLATE),
     "nominal-1000": Case(
         "mirrors like a DM97, a Gaussian nominal mirror, 1,000 frames", "razor-shwfs", 1000, _GAUSSIAN_NOMINAL
-    ),
-    "imperfect-1000": Case(
-        "as bundled, all imperfections of the sensor drawn, 1,000 frames", "razor-shwfs", 1000, imperfect=True
     ),
     "dm97-1500": Case("mirrors like a DM97, 1,500 frames", "razor-pywfs", 1500, dm97=True),
     "oopao-1000": Case(
@@ -112,15 +101,9 @@ def measure(folder: Path, name: str) -> None:
     case = CASES[name]
     each_realisation(
         table_path(folder, name),
-        {
-            "system": case.system,
-            "frames": case.frames,
-            "set": list(case.overrides),
-            "dm97": case.dm97,
-            "imperfect": case.imperfect,
-        },
+        {"system": case.system, "frames": case.frames, "set": list(case.overrides), "dm97": case.dm97},
         REALISATIONS,
-        case.measure,
+        lambda number: run_realisation(case.system, number, case.frames, list(case.overrides), case.dm97),
         lambda row: f"{name} {np.round(row['error'], 3).tolist()}",
     )
 

@@ -217,8 +217,8 @@ def pupil_from_lenslets(config: SystemConfig, grid: SubApertureGrid) -> PupilGeo
     usable = whole & grid.valid & (grid.flux > 0)
     if usable.sum() < _MIN_LENSLETS:
         return pupil
-    centres = (np.arange(n) - (n - 1) / 2) / (n / 2)
-    y, x = (centres[k] for k in np.nonzero(usable))
+    rows, columns = np.nonzero(usable)
+    x, y = (np.asarray((at - (n - 1) / 2) / (n / 2), float) for at in (columns, rows))
     ratio = np.log(grid.flux[usable] / expected[usable])
     coefficients = _fit_without_outliers(_quadratic(x, y), ratio)
     u = pupil.coordinates_m / (n * pupil.sub_aperture_m / 2)
@@ -235,12 +235,12 @@ def _quadratic(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.flo
 def _fit_without_outliers(basis: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.float64]:
     """Coefficients ``(k,)`` of ``basis (k, n)`` for ``values (n,)``, without dirty or broken lenslets."""
     used = np.ones(values.size, bool)
-    coefficients = np.zeros(len(basis))
+    coefficients: NDArray[np.float64] = np.zeros(len(basis))
     for _ in range(_OUTLIER_ROUNDS):
-        coefficients = np.linalg.lstsq(basis[:, used].T, values[used])[0]
+        coefficients = np.asarray(np.linalg.lstsq(basis[:, used].T, values[used])[0], float)
         away = np.abs(values - coefficients @ basis)
         used = away <= _OUTLIER * max(float(np.median(away)), 1e-12)
-    return np.asarray(coefficients)
+    return coefficients
 
 
 def default_samples(config: SystemConfig) -> int:
