@@ -37,6 +37,20 @@ def test_none_is_vouched_for_and_wrong(validation):
         assert np.abs(pulls).max() < MAX_PULL, name
 
 
+def test_errors_are_neither_too_small_nor_too_large(validation):
+    """Normalised chi-squared of every parameter, for the mirrors like a DM97 and on REVOLT."""
+    tables = validation.measured_cases(FOLDER)
+    for name in validation.HONEST:
+        rows = [row for row in tables[name] if row["converged"]]
+        chi2 = np.mean([np.square(np.divide(row["error"], row["sigma"])) for row in rows], axis=0)
+        assert ((chi2 > 0.45) & (chi2 < 2.0)).all(), (name, chi2)
+
+
+def test_a_mirror_that_the_model_does_not_describe_is_flagged(validation):
+    for row in validation.measured_cases(FOLDER)["thin-plate-1000"]:
+        assert row["outcome"] in ("NOT converged", "converged, but the model does not fit")
+
+
 def test_the_limits_that_the_page_claims(validation):
     """Rms errors: shift in % of a sub-aperture, rotation in degrees, scalings in % of the diameter."""
     tables = validation.measured_cases(FOLDER)
