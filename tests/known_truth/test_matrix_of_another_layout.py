@@ -13,6 +13,7 @@ from escape_hw.config.system import SystemConfig
 from escape_hw.deprecation import RenamedWarning
 from escape_hw.errors import IncompatibleProduct
 from escape_hw.io.fits.matrix import MatrixProduct, load_matrix, save_matrix
+from escape_hw.runtime.procedures.matrix_input import load_fitting_matrix
 from escape_hw.runtime.procedures.sprint import SprintProcedure
 from escape_hw.runtime.session.record import BenchRecord
 from escape_hw.runtime.session.system import System
@@ -57,6 +58,14 @@ def test_every_way_to_use_it_in_python_refuses_it(rings: MatrixProduct) -> None:
 def test_sprint_refuses_its_file(rings: MatrixProduct) -> None:
     with pytest.raises(IncompatibleProduct, match=r"im\.fits: was measured with the layout 'rings-336'"):
         SprintProcedure(im=rings.path).load(configuration())
+
+
+def test_the_layout_is_judged_before_modes_and_sub_apertures(rings: MatrixProduct) -> None:
+    """No other setting would make the matrix fit, so none is advised."""
+    with pytest.raises(IncompatibleProduct, match="was measured with the layout 'rings-336'"):
+        SprintProcedure(im=rings.path).load(configuration("sensor.n_sub=24"))
+    with pytest.raises(IncompatibleProduct, match="was measured with the layout 'rings-336'"):
+        load_fitting_matrix(rings.path, configuration("basis.n_modes=11"))
 
 
 def test_a_matrix_without_a_layout_is_judged_by_its_numbers(rings: MatrixProduct) -> None:
