@@ -162,6 +162,8 @@ def contamination_ratio(tables: dict[str, list[Line]]) -> str:
 def draw(tables: dict[str, list[Line]], target: Path) -> None:
     """Errors of all realisations in their standard errors, a row of points per parameter."""
     figure = new_figure(8.0, 0.9 + 1.15 * len(tables))
+    converged = [row for rows in tables.values() for row in rows if row["converged"]]
+    limit = np.ceil(max(4.0, *(np.abs(np.divide(row["error"], row["sigma"])).max() for row in converged)))
     for axes, (name, rows) in zip(
         np.atleast_1d(figure.subplots(len(tables), 1)), tables.items(), strict=True
     ):
@@ -169,8 +171,8 @@ def draw(tables: dict[str, list[Line]], target: Path) -> None:
         for k, parameter in enumerate(PARAMETERS):
             pulls = [row["error"][k] / row["sigma"][k] for row in rows if row["converged"]]
             axes.plot(pulls, np.full(len(pulls), -k), ".", color=SERIES[0], ms=5, alpha=0.6)
-            axes.text(-4.15, -k, parameter.replace("_", " "), ha="right", va="center", fontsize=7)
-        axes.set(xlim=(-4, 4), ylim=(-4.6, 0.6), yticks=[])
+            axes.text(-1.04 * limit, -k, parameter.replace("_", " "), ha="right", va="center", fontsize=7)
+        axes.set(xlim=(-limit, limit), ylim=(-4.6, 0.6), yticks=[])
         axes.axvspan(-1, 1, color=SERIES[0], alpha=0.08, lw=0)
         axes.set_title(f"{CASES[name].system}, {CASES[name].title}", loc="left", fontsize=8)
     axes.set_xlabel("error [standard errors]")
