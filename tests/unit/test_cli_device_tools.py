@@ -67,7 +67,7 @@ def nothing_opens(monkeypatch):
     [
         (("dm", "poke", "razor-shwfs", 97, 0.1), "actuator 97 does not exist; the mirror has 0 to 96"),
         (("dm", "poke", "razor-shwfs", 0, 0.9), "beyond its limits, which allow 0.8"),
-        (("dm", "poke", "razor-shwfs", 0, "nan"), "actuator 0 is nan"),
+        (("dm", "poke", "razor-shwfs", 0, "nan"), "amplitude is nan; it must be a number"),
         (("dm", "poke", "razor-shwfs", 0, 0.1, "--second", 1), "--second"),
         (("dm", "poke", "maps-nir", 260, 0.01), "disabled"),
         (("dm", "poke", "maps-nir", 0, 0.5, "--seconds", 0), "beyond its limits, which allow 0.2"),

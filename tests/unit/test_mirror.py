@@ -209,7 +209,7 @@ def test_a_failed_opening_leaves_nothing_half_open() -> None:
 
 def test_limits_that_do_not_fit_are_refused_on_opening_and_the_link_closed() -> None:
     dm = Flaky(MirrorLimits(disabled=(N,)))
-    with pytest.raises(SettingRejected, match=r"dm: its limits do not fit: .*0\.\.20"):
+    with pytest.raises(SettingRejected, match=r"dm: its limits do not fit .*0\.\.20"):
         dm.open()
     assert (dm.is_open, dm.closings) == (False, 1)
 
