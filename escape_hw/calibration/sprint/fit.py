@@ -392,6 +392,9 @@ def _require_fittable(matrix: InteractionMatrix, model: SyntheticModel, columns:
         raise CalibrationError("the interaction matrix is not finite; measure it again")
     if not data.any():
         raise CalibrationError("the interaction matrix is zero; does the sensor see the mirror?")
+    for axis, half in zip("xy", np.split(data, 2), strict=True):
+        if not half.any():
+            raise CalibrationError(f"all {axis} slopes are zero; are they computed and in the matrix?")
     if not np.isfinite(sigma).all():
         raise CalibrationError("the interaction matrix's standard errors are not finite; measure it again")
     if (sigma > 0).all() and float(matrix.snr()[columns].max()) < _MIN_SNR:
