@@ -37,8 +37,9 @@ def pyramid(n: int = 16, seed: int = 4) -> CalibrationResult:
     corners = np.array([[5, 4], [28, 5], [4, 27], [29, 28]])
     references = rng.normal(0, 0.05, (int(valid.sum()), 2)).astype(np.float32)
     pupils = PyramidPupils(
-        corners + (n - 1) / 2, float(n), corners.astype(np.intp), valid, references, valid.astype(np.float32)
-    )
+        corners + (n - 1) / 2, float(n), corners.astype(np.intp), valid, references,
+        valid.astype(np.float32), mean_low_orders=rng.normal(0, 0.1, (6, 2)),
+    )  # fmt: skip
     data = rng.standard_normal((2 * int(valid.sum()), 20)).astype(np.float32)
     sigma = np.full_like(data, 0.01)
     matrix = InteractionMatrix(

@@ -71,6 +71,9 @@ class PyramidPupils(SensorGeometry):
     residual_tilt
         Temporal rms per axis of the slopes' mean over the pupil in closed loop, where the modes have taken
         most of the turbulence; 0 in open loop.
+    mean_low_orders
+        Low orders of the mean slopes in the measurement, before the references are subtracted:
+        coefficients ``(6, 2)`` as (x, y) of :func:`low_order_terms`; ``None`` if unknown.
     """
 
     kind: ClassVar[str] = "pyramid"
@@ -97,6 +100,7 @@ class PyramidPupils(SensorGeometry):
     n_effective: float = 0.0
     persistent_fraction: float = 0.0
     residual_tilt: float = 0.0
+    mean_low_orders: NDArray[np.float64] | None = None
     __repr__ = short_repr
 
     def outlines(self) -> tuple[tuple[float, float, float], ...]:
@@ -110,17 +114,40 @@ class PyramidPupils(SensorGeometry):
         n_effective: float = 0.0,
         persistent_fraction: float = 0.0,
         residual_tilt: float = 0.0,
+        mean: NDArray[np.float64] | None = None,
     ) -> PyramidPupils:
         """See :meth:`SensorGeometry.with_slope_statistics`."""
+        low_orders = None
+        if mean is not None:
+            slopes = mean.reshape(2, -1).T + self.references
+            low_orders = fit_low_orders(slopes, self.valid, self.flux)
         return replace(
             self, motion=rms, pokes=pokes, n_effective=n_effective, persistent_fraction=persistent_fraction,
-            residual_tilt=residual_tilt,
+            residual_tilt=residual_tilt, mean_low_orders=low_orders,
         )  # fmt: skip
 
     def with_mean_slopes(self, mean: NDArray[np.float64]) -> PyramidPupils:
         """See :meth:`SensorGeometry.with_mean_slopes`; only the part that is not smooth is added."""
         new_references = self.references + remove_low_orders(mean.reshape(2, -1).T, self.valid, self.flux)
         return replace(self, references=new_references.astype(np.float32))
+
+
+def low_order_terms(valid: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Second-degree polynomials over the pupil at the valid pixels ``(n_valid, 6)``; its radius is 1."""
+    n = valid.shape[0]
+    rows, columns = np.nonzero(valid)
+    x, y = (2 * columns - (n - 1)) / n, (2 * rows - (n - 1)) / n
+    return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
+
+
+def fit_low_orders(
+    slopes: NDArray[np.float64], valid: NDArray[np.bool_], flux: NDArray[np.float32]
+) -> NDArray[np.float64]:
+    """Coefficients ``(6, 2)`` of the low orders of slopes ``(n_valid, 2)``, fitted in the inner pupil."""
+    terms = low_order_terms(valid)
+    inner = np.square(terms[:, 1:3]).sum(axis=1) < _INNER_RADIUS**2
+    weight = np.sqrt(np.maximum(flux[valid], 0.0))[inner, None]
+    return np.asarray(np.linalg.lstsq(terms[inner] * weight, slopes[inner] * weight, rcond=None)[0])
 
 
 def remove_low_orders(
@@ -140,14 +167,7 @@ def remove_low_orders(
     valid, flux
         As in :class:`PyramidPupils`, ``(n, n)``.
     """
-    n = valid.shape[0]
-    rows, columns = np.nonzero(valid)
-    x, y = (2 * columns - (n - 1)) / n, (2 * rows - (n - 1)) / n
-    terms = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
-    inner = x * x + y * y < _INNER_RADIUS**2
-    weight = np.sqrt(np.maximum(flux[valid], 0.0))[inner, None]
-    coefficients = np.linalg.lstsq(terms[inner] * weight, slopes[inner] * weight, rcond=None)[0]
-    return np.asarray(slopes - terms @ coefficients)
+    return np.asarray(slopes - low_order_terms(valid) @ fit_low_orders(slopes, valid, flux))
 
 
 def pupil_boxes(centres_px: NDArray[np.float64], n: int) -> NDArray[np.intp]:

@@ -82,6 +82,7 @@ class SensorGeometry(abc.ABC):
         n_effective: float = 0.0,
         persistent_fraction: float = 0.0,
         residual_tilt: float = 0.0,
+        mean: NDArray[np.float64] | None = None,
     ) -> Self:
         """The geometry with the slope statistics of a measurement.
 
@@ -97,6 +98,8 @@ class SensorGeometry(abc.ABC):
             Fraction of the slope variance that is correlated over two frames; 0 if unknown.
         residual_tilt
             In closed loop: temporal rms per axis of the slopes' mean over the pupil; 0 in open loop.
+        mean
+            Mean slopes ``(n_slopes,)`` relative to the references; ``None`` if unknown.
         """
 
     @abc.abstractmethod
@@ -223,6 +226,7 @@ class SubApertureGrid(SensorGeometry):
         n_effective: float = 0.0,
         persistent_fraction: float = 0.0,
         residual_tilt: float = 0.0,
+        mean: NDArray[np.float64] | None = None,
     ) -> SubApertureGrid:
         """See :meth:`SensorGeometry.with_slope_statistics`.
 

@@ -100,14 +100,18 @@ def test_a_loop_that_stands_at_a_tilt_is_found(loop: Loop) -> None:
     n = loop.phases.shape[1]
     y, x = (np.indices((n, n)) - (n - 1) / 2) / n
     tilted = [loop.slopes(phase + 2 * np.pi * (tilt[0] * x + tilt[1] * y)) for phase in loop.phases]
-    mean = np.mean(tilted, axis=0).reshape(2, -1).mean(axis=1)
-    references = np.tile(mean, (loop.pupils.valid.sum(), 1)).astype(np.float32)
-    model = PyramidModel(loop.config, replace(loop.geometry, references=references))
-    assert model._modulation.points.mean(axis=0) == pytest.approx(tilt, abs=0.08)
+    references = np.mean(tilted, axis=0).reshape(2, -1).T.astype(np.float32)
+    geometry = replace(loop.geometry, references=references).with_slope_statistics(
+        loop.geometry.motion, residual_tilt=loop.geometry.residual_tilt, mean=np.zeros(2 * len(references))
+    )
+    model = PyramidModel(loop.config, geometry)
+    lit = model._pupil.lit
+    terms = np.stack([np.ones_like(x), x, y], axis=2)[lit]
+    assert model.mean_phase is not None
+    found = np.linalg.lstsq(terms, model.mean_phase[lit])[0][1:] / (2 * np.pi)
+    assert found == pytest.approx(tilt, abs=0.08)
     for variant in model.variants():
-        assert variant._modulation.points.mean(axis=0) == pytest.approx(
-            model._modulation.points.mean(axis=0), abs=1e-9
-        )
+        assert variant.mean_phase is model.mean_phase
 
 
 def test_the_mean_response_has_the_size_of_frames(loop: Loop) -> None:

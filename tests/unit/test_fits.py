@@ -16,6 +16,7 @@ import fake_results as fake
 import numpy as np
 import pytest
 from astropy.io import fits
+from interchange_cases import pyramid
 
 from escape_hw.api.results import Estimate
 from escape_hw.errors import IncompatibleProduct, ProductError, StorageError
@@ -392,3 +393,13 @@ def test_killed_writer_leaves_the_old_product(saved):
     done = subprocess.run([sys.executable, "-c", script, str(saved)], env=os.environ, check=False)
     assert done.returncode == 9
     assert saved.read_bytes() == before
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_the_mean_wavefront_of_a_pyramid_is_read_back(tmp_path: Path, known: bool) -> None:
+    result = pyramid()
+    if not known:  # as in files of earlier versions
+        result = dataclasses.replace(result, grid=dataclasses.replace(result.grid, mean_low_orders=None))
+    back = load_matrix(save_matrix(tmp_path / "im.fits", result)).result.grid
+    want = result.grid.mean_low_orders
+    assert back.mean_low_orders == (pytest.approx(want) if known else None)

@@ -6,7 +6,7 @@ import fake_results as fake
 import numpy as np
 import pytest
 
-from escape_hw.api.pyramid import PyramidPupils
+from escape_hw.api.pyramid import PyramidPupils, fit_low_orders
 from escape_hw.calibration.acquisition.slope_statistics import SlopeStatistics
 
 
@@ -80,8 +80,8 @@ def test_too_few_frames_give_no_number_of_samples() -> None:
 
 def test_a_resumed_run_gives_the_same() -> None:
     rng = np.random.default_rng(7)
-    slopes, pokes = rng.standard_normal((300, 16)).cumsum(axis=0), rng.standard_normal((300, 4))
-    whole, first, second = SlopeStatistics(16), SlopeStatistics(16), SlopeStatistics(16)
+    slopes, pokes = rng.standard_normal((300, 128)).cumsum(axis=0), rng.standard_normal((300, 4))
+    whole, first, second = (SlopeStatistics(128) for _ in range(3))
     for k in range(300):
         whole.add(slopes[k].astype(np.float32), pokes[k])
         if k == 170:
@@ -94,12 +94,15 @@ def test_a_resumed_run_gives_the_same() -> None:
     # Two pairs across the interruption are lost.
     assert other.n_effective == pytest.approx(one.n_effective, rel=0.03)
     assert other.persistent_fraction == pytest.approx(one.persistent_fraction, abs=0.02)
-    seen = slopes.reshape(300, 2, 8).mean(axis=2)
+    seen = slopes.reshape(300, 2, 64).mean(axis=2)
     for statistics in (whole, second):
         closed = statistics.annotate_geometry(pupils(), closed=True)
         assert isinstance(closed, PyramidPupils)
         assert closed.residual_tilt == pytest.approx(np.sqrt(seen.var(axis=0).mean()), rel=1e-4)
     assert one.residual_tilt == 0
+    low_orders = fit_low_orders(slopes.mean(axis=0).reshape(2, 64).T, one.valid, one.flux)
+    assert one.mean_low_orders == pytest.approx(low_orders, rel=1e-4, abs=1e-4)
+    assert other.mean_low_orders == pytest.approx(one.mean_low_orders)
 
 
 def test_a_state_of_version_0_1_0_has_no_tilt() -> None:

@@ -60,6 +60,7 @@ def test_calibration_and_telemetry_come_back(tmp_path: Path, make: Any) -> None:
         assert isinstance(back.geometry, PyramidPupils)
         np.testing.assert_array_equal(back.geometry.corners_px, result.grid.corners_px)
         np.testing.assert_array_equal(back.geometry.centres_px, result.grid.centres_px)
+        assert back.geometry.mean_low_orders == pytest.approx(result.grid.mean_low_orders)
     assert back.telemetry is not None
     np.testing.assert_array_equal(back.telemetry.index, record.index)
     np.testing.assert_array_equal(back.telemetry.slopes, record.slopes)

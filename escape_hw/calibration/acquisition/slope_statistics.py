@@ -95,7 +95,7 @@ class SlopeStatistics:
         self._recent_slopes.clear()
 
     def annotate_geometry(self, grid: SensorGeometry, *, closed: bool = False) -> SensorGeometry:
-        """Return the geometry with rms of slopes and pokes, number of independent samples and persistence.
+        """Return the geometry with mean and rms of the slopes, pokes, independent samples and persistence.
 
         In closed loop (``closed``) the persistent part of the slopes is not attributed to turbulence, and the
         rms of the tilt is given instead.
@@ -109,7 +109,7 @@ class SlopeStatistics:
         n_effective = self._effective_samples(variance, persistent_fraction, poked=poke_rms > 0)
         return grid.with_slope_statistics(
             float(np.sqrt(variance)), poke_rms, n_effective, 0.0 if closed else persistent_fraction,
-            self._tilt_rms() if closed else 0.0,
+            self._tilt_rms() if closed else 0.0, self._sum / self._n_frames,
         )  # fmt: skip
 
     def update_references(

@@ -46,6 +46,8 @@ _CARDS: dict[str, dict[str, str]] = {
 
 #: Header cards of ``SubApertureGrid.numbering_offsets``: least and largest along x, then along y.
 _NUMBERING = ("NUMBXMIN", "NUMBXMAX", "NUMBYMIN", "NUMBYMAX")
+#: Header cards of ``PyramidPupils.mean_low_orders``, those of the x slopes before those of the y slopes.
+_LOW_ORDERS = tuple(f"MEAN{axis}{number}" for axis in "XY" for number in range(6))
 
 
 def geometry_cards(geometry: SensorGeometry) -> dict[str, float | str]:
@@ -54,6 +56,8 @@ def geometry_cards(geometry: SensorGeometry) -> dict[str, float | str]:
     if isinstance(geometry, SubApertureGrid):
         values |= {"ORIGINX": geometry.origin_px[0], "ORIGINY": geometry.origin_px[1]}
         values |= dict(zip(_NUMBERING, np.ravel(geometry.numbering_offsets), strict=True))
+    if isinstance(geometry, PyramidPupils) and geometry.mean_low_orders is not None:
+        values |= dict(zip(_LOW_ORDERS, geometry.mean_low_orders.T.ravel(), strict=True))
     return {key: value if isinstance(value, str) else float(value) for key, value in values.items()}
 
 
@@ -66,6 +70,9 @@ def geometry_fields(kind: str, cards: Mapping[str, Any]) -> dict[str, Any]:
     if kind == SubApertureGrid.kind:
         offsets = [int(cards.get(key, 0)) for key in _NUMBERING]
         fields["numbering_offsets"] = (tuple(offsets[:2]), tuple(offsets[2:]))
+    elif all(key in cards for key in _LOW_ORDERS):
+        coefficients = [float(cards[key]) for key in _LOW_ORDERS]
+        fields["mean_low_orders"] = np.reshape(coefficients, (2, -1)).T
     return fields
 
 

@@ -23,7 +23,8 @@ from escape_sim.mirror.mode_surfaces import (
     surface_nodes,
 )
 from escape_sim.models.base import DesignModel
-from escape_sim.models.pyramid_response import slope_response
+from escape_sim.models.pyramid_mean_phase import coarse_pupils, estimate_mean_phase
+from escape_sim.models.pyramid_response import SlopeResponse, slope_response
 from escape_sim.models.pyramid_turbulence import (
     PokePhase,
     Turbulence,
@@ -89,10 +90,10 @@ class PyramidModel(DesignModel):
     """Small-signal slopes of a modulated pyramid with a mirror of Gaussian actuators.
 
     The derivatives of the slopes by the phase are computed once, at a flat wavefront or averaged over
-    turbulence whose strength is estimated from the motion of the slopes. They are stored at the few
-    nodes that interpolate a mirror surface, so a matrix under any registration is one product. The
-    average matters: open-loop turbulence of 22 r0 across the pupil lowers the response to 0.38 (low
-    order modes), 0.31 (middle) and 0.53 (high) of its value without turbulence.
+    turbulence whose strength is estimated from the motion of the slopes, about the mean wavefront of the
+    measurement. They are stored at the few nodes that interpolate a mirror surface, so a matrix under any
+    registration is one product. The average matters: open-loop turbulence of 22 r0 across the pupil lowers
+    the response to 0.38 (low order modes), 0.31 (middle) and 0.53 (high) of its value without turbulence.
 
     Parameters
     ----------
@@ -106,6 +107,8 @@ class PyramidModel(DesignModel):
         Modes ``(n_act, n_modes)`` that were poked; by default those of the configuration.
     phases
         The turbulence over the pupil; by default as measured.
+    mean_phase
+        Mean phase ``(n, n)`` in radians over the pupil; by default as measured.
 
     Raises
     ------
@@ -124,6 +127,7 @@ class PyramidModel(DesignModel):
         turbulence: float | None = None,
         basis: NDArray[np.float64] | None = None,
         phases: Turbulence | None = None,
+        mean_phase: NDArray[np.float64] | None = None,
     ) -> None:
         pupil = pupil_from_images(config, pupils)
         super().__init__(config, pupil)
@@ -137,15 +141,18 @@ class PyramidModel(DesignModel):
             turbulence = estimate_strength(self.optics(), pupils, self._phases.phases(1.0), self._pokes)
         self.turbulence = turbulence if turbulence >= _NEGLIGIBLE_STRENGTH else 0.0
         if phases is None and self.turbulence and pupils.residual_tilt:
-            tilt = self._phases.estimate_left(self.optics(), pupils, self.turbulence, self._pokes)
-            self._modulation = self._modulation.displaced(tilt * pupil.n_sub * pupil.n_pix)
+            self._phases.estimate_left(self.optics(), pupils, self.turbulence, self._pokes)
         sigma = self._gaussian.pitch_m / np.sqrt(2 * np.log(1 / self._gaussian.coupling))
         if not isinstance(self._nominal, InfluenceFunctions):
             sigma *= _SHARPER
         elif self._nominal.profile != SINGLE_GAUSSIAN:
             sigma *= _SHARPER_PROFILE
         self._nodes, self._interpolation = surface_nodes(pupil.coordinates_m, sigma)
-        self._response = self._compute_phase_derivatives()
+        #: Phase ``(n, n)`` in radians about which the response is; ``None``: flat.
+        self.mean_phase = mean_phase
+        if mean_phase is None and self.turbulence and pupils.mean_low_orders is not None:
+            self.mean_phase = self._estimate_mean_phase()
+        self._response = self._slope_response(pupils.valid).phase_derivatives
         self._response *= np.float32(scale)
         self._executor = ThreadPoolExecutor(1, "pyramid-model")
         self._variants: list[PyramidModel] | None = None
@@ -281,8 +288,7 @@ class PyramidModel(DesignModel):
                 elliptic = ModulationPath.circle(
                     radius, ellipse=section.ellipticity_sigma, ellipse_angle=angle
                 )
-                centre = self._modulation.points.mean(axis=0)
-                changes.append(self._variant(modulation=elliptic.displaced(centre)))
+                changes.append(self._variant(modulation=elliptic))
             for axis in range(2):
                 centres = self._pupils.centres_px.copy()
                 centres[:, axis] += section.image_position_sigma_px * _DIAGONALS
@@ -302,7 +308,7 @@ class PyramidModel(DesignModel):
         return PyramidModel(
             self._config, pupils or self._pupils, modulation=modulation or self._modulation,
             turbulence=self.turbulence if turbulence is None else turbulence, basis=self._modes,
-            phases=self._phases,
+            phases=self._phases, mean_phase=self.mean_phase,
         )  # fmt: skip
 
     def _turbulence_uncertainty(self) -> NDArray[np.float64]:
@@ -348,8 +354,8 @@ class PyramidModel(DesignModel):
             self._pupils.pokes, max_amplitude, scale * np.tensordot(m2c.T, surfaces, 1), lit
         )
 
-    def _compute_phase_derivatives(self) -> NDArray[np.float32]:
-        """Derivatives of the slopes by the phase at the nodes ``(n_slopes, m * m)``."""
+    def _slope_response(self, pixels: NDArray[np.bool_]) -> SlopeResponse:
+        """Slopes at pixels ``(n_sub, n_sub)`` and their derivatives by the phase at the nodes."""
         pupils, pupil = self._pupils, self._pupil
         n, samples = len(pupil.coordinates_m), pupil.n_pix
         shape = self._config.devices.wfs.region[:1:-1]
@@ -360,9 +366,18 @@ class PyramidModel(DesignModel):
             structure = self._phases.structure(self.turbulence)
         return slope_response(
             pupil.amplitude, Prism(region.shifts(n), pupil.n_sub * samples), grid * samples,
-            pupils.corners_px - region.first, pupils.valid, self._modulation, structure, pairs=pairs,
+            pupils.corners_px - region.first, pixels, self._modulation, structure, pairs=pairs,
             interpolation=self._interpolation, samples=samples, local=pupils.normalisation == "local",
-        ).phase_derivatives  # fmt: skip
+            phase=self.mean_phase,
+        )  # fmt: skip
+
+    def _estimate_mean_phase(self) -> NDArray[np.float64]:
+        """Mean phase ``(n, n)`` during the measurement, from its mean slopes."""
+        radius_m, pixels = self._config.system.pupil_m / 2, coarse_pupils(self._pupils)
+        return estimate_mean_phase(
+            self._slope_response(pixels), pixels, self._pupils, self._nodes / radius_m,
+            self._pupil.coordinates_m / radius_m,
+        )  # fmt: skip
 
     def _pair_structure(self) -> NDArray[np.float32] | None:
         """Structure function of all pairs of lit samples; ``None`` where the phase is stationary.

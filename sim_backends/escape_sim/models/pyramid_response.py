@@ -17,25 +17,27 @@ from escape_sim.optics.modulation import ModulationPath
 from escape_sim.optics.pyramid import Prism, frequencies
 
 
+#: Pupil field ``(n, n)``: the amplitude, complex about a wavefront that is not flat.
+_Light = NDArray[np.float32] | NDArray[np.complex64]
+
+
 @njit(cache=True, fastmath=True, nogil=True)
 def _shifted_kernel(kernel, row, column, light, out):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """``out[i, j] = conj(kernel[row - i, column - j]) light[i, j]``."""
+    """``out[i, j] = conj(kernel[row - i, column - j] light[i, j])``."""
     for i in range(light.shape[0]):
         line, amplitude, target = kernel[row - i], light[i], out[i]
         for j in range(amplitude.size):
-            target[j] = line[column - j].conjugate() * amplitude[j]
+            target[j] = (line[column - j] * amplitude[j]).conjugate()
 
 
 class ModulatedCorrelations:
     """Correlations of a modulation without turbulence: matrix products over its points.
 
     Correlations are means of ``conj(E(u)) f(p) / A(p)`` for the field ``E`` at a pixel and the pupil
-    field ``f``. Parameters as for :func:`slope_response`; ``light`` is the pupil amplitude ``(n, n)``.
+    field ``f``. Parameters as for :func:`slope_response`; ``light`` is the pupil field ``(n, n)``.
     """
 
-    def __init__(
-        self, light: NDArray[np.float32], prism: Prism, n_grid: int, modulation: ModulationPath
-    ) -> None:
+    def __init__(self, light: _Light, prism: Prism, n_grid: int, modulation: ModulationPath) -> None:
         n = len(light)
         at = np.arange(n) - (n - 1) / 2
         x, y = modulation.points.T[:, :, None, None] / prism.diameter
@@ -61,13 +63,11 @@ class ModulatedCorrelations:
 class TurbulentCorrelations:
     """Correlations of a modulation under stationary turbulence: one convolution with the coherence per pixel.
 
-    ``light`` is the pupil amplitude ``(n, n)``, ``kernel`` the point response from :func:`_prism_kernel`,
+    ``light`` is the pupil field ``(n, n)``, ``kernel`` the point response from :func:`_prism_kernel`,
     ``mean`` the :func:`coherence`. Not thread-safe.
     """
 
-    def __init__(
-        self, light: NDArray[np.float32], kernel: NDArray[np.complex64], mean: NDArray[np.complex128]
-    ) -> None:
+    def __init__(self, light: _Light, kernel: NDArray[np.complex64], mean: NDArray[np.complex128]) -> None:
         self._filter = _convolution(mean, len(light))
         self._light, self._kernel = light, kernel
 
@@ -89,13 +89,13 @@ class PairwiseCorrelations:
 
     def __init__(
         self,
-        light: NDArray[np.float32],
+        light: _Light,
         kernel: NDArray[np.complex64],
         diameter: float,
         modulation: ModulationPath,
         structure: NDArray[np.float32],
     ) -> None:
-        lit = light > 0
+        lit = light != 0
         self._kernel, self._lit = kernel, lit
         self._rows, self._columns = np.nonzero(lit)
         at = np.stack([self._columns, self._rows], axis=1) * (2 * np.pi / diameter)
@@ -109,7 +109,7 @@ class PairwiseCorrelations:
         # Characteristic function of a Gaussian phase.
         self._coherence = coherence.astype(single) * np.exp(np.float32(-0.5) * structure)
         self._tilt = np.exp(1j * at @ centre).astype(np.complex64)
-        self._light = light[lit] * self._tilt.conj()
+        self._light = (light[lit] * self._tilt).conj()
 
     def correlations(self, pixels: NDArray[np.intp]) -> Iterator[NDArray[np.complex64]]:
         """Yield ``n`` rows of ``n`` samples for each (row, column) ``u`` in ``pixels``."""
@@ -187,12 +187,12 @@ def _add_pixel_response(kernel, row, column, light, correlations, spans, weights
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SlopeResponse:
-    """Slopes of a flat wavefront ``flat (n_slopes,)``, all x then all y, and their derivatives.
+    """Slopes of a mean wavefront ``mean (n_slopes,)``, all x then all y, and their derivatives.
 
     ``phase_derivatives (n_slopes, m * m)`` are by the phase at the nodes, rows along y, in 1 / rad.
     """
 
-    flat: NDArray[np.float64]
+    mean: NDArray[np.float64]
     phase_derivatives: NDArray[np.float32]
 
 
@@ -209,6 +209,7 @@ def slope_response(
     interpolation: NDArray[np.float32] | None = None,
     samples: int = 1,
     local: bool = False,
+    phase: NDArray[np.float64] | None = None,
 ) -> SlopeResponse:
     """Compute the derivatives of all slopes by the phase.
 
@@ -244,13 +245,17 @@ def slope_response(
         Pupil samples across a camera pixel.
     local
         Normalise by each pixel's own flux instead of the mean of all.
+    phase
+        Phase ``(n, n)`` in radians about which the slopes are differentiated; flat by default.
 
     Raises
     ------
     ValueError
         The boxes leave the grid.
     """
-    light = np.ascontiguousarray(amplitude, dtype=np.float32)
+    light: _Light = np.ascontiguousarray(amplitude, dtype=np.float32)
+    if phase is not None:
+        light = np.ascontiguousarray(light * np.exp(1j * phase), dtype=np.complex64)
     first_samples = (corners[:, None, ::-1] + np.argwhere(valid)) * samples
     if first_samples.min() < 0 or first_samples.max() + samples > n_grid:
         raise ValueError("the pupil images leave the periodic grid; enlarge the camera region")
@@ -278,7 +283,7 @@ class _ResponseSums:
     def __init__(
         self,
         kernel: NDArray[np.complex64],
-        light: NDArray[np.float32],
+        light: _Light,
         first_samples: NDArray[np.intp],
         samples: int,
         interpolation: NDArray[np.float32] | None,
@@ -287,7 +292,7 @@ class _ResponseSums:
         self._kernel, self._light, self._first_samples = kernel, light, first_samples
         self._samples, self._interpolation, self._local = samples, interpolation, local
         # First lit column of each row and the one after the last.
-        self._spans = np.stack(lit_columns(np.asarray(light > 0)), axis=1)
+        self._spans = np.stack(lit_columns(np.asarray(light != 0)), axis=1)
         m, n_valid = len(light) if interpolation is None else interpolation.shape[1], first_samples.shape[1]
         self._derivatives = np.empty((2, n_valid, m, m), np.float32)
         # Difference along x, along y, and sum of each pixel's four images.

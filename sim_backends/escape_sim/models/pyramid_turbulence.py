@@ -146,51 +146,37 @@ class Turbulence:
 
     def estimate_left(
         self, optics: PyramidOptics, pupils: PyramidPupils, strength: float, pokes: PokePhase | None
-    ) -> NDArray[np.float64]:
-        """Set :attr:`left` from the tilt of the slopes, and find the mean tilt at which the loop stands.
+    ) -> None:
+        """Set :attr:`left` from the tilt of the slopes.
 
         A loop corrects the tilt with the other modes. The slopes' mean over the pupil gives the tilt that is
         left, by the response to a small tilt on the corrected turbulence; pokes are part of it. The tilt
-        without a loop is that of the structure function. On average the loop holds the slopes at the
-        references, whose mean a flat wavefront need not have: it has another one where the four images are
-        not on a square, because the faces then meet in ridges.
-
-        Returns
-        -------
-        numpy.ndarray
-            Mean tilt ``(2,)`` of the wavefront along x and y, waves per sample.
+        without a loop is that of the structure function.
         """
         whole = structure_function(self._distances, 1 / strength, self._outer_scale)
         states = self._corrected * strength ** (5 / 6)
-        tilts, radians_per_sample = _unit_tilts(self._lit)
-        responses, ratios, means = np.empty((2, 2)), [], np.zeros(2)
-        for axis, tilt in enumerate(tilts):
+        ratios = []
+        for axis, tilt in enumerate(_unit_tilts(self._lit)):
             step = _TILT_RAD * tilt
             up, down = (
-                np.array([_mean_slopes(optics, pupils, state + change) for state in states])
+                np.array([_mean_slopes(optics, pupils, state + change)[axis] for state in states])
                 for change in (step, -step)
             )
-            responses[:, axis] = (up - down).mean(axis=0) / (2 * _TILT_RAD)
-            means += (up + down).mean(axis=0) / 4
+            response = (up - down).mean() / (2 * _TILT_RAD)
             # Other modes have a mean slope as well.
-            others = ((up + down) / 2)[:, axis].var(ddof=1)
-            variance = (pupils.residual_tilt**2 - others) / responses[axis, axis] ** 2
+            others = ((up + down) / 2).var(ddof=1)
+            variance = (pupils.residual_tilt**2 - others) / response**2
             if pokes is not None:
                 variance -= np.square((pokes.modes_rad * tilt)[:, self._lit].mean(axis=1)).sum()
             ratios.append(max(variance, 0.0) / _projected_variance(tilt / np.count_nonzero(self._lit), whole))
         self.left = min(float(np.sqrt(np.mean(ratios))), 1.0)
-        return np.asarray(np.linalg.solve(responses, -means) * radians_per_sample / (2 * np.pi))
 
 
-def _unit_tilts(lit: NDArray[np.bool_]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Tilts along x and y ``(2, n, n)`` of rms 1 and mean 0 over the lit samples, and their slopes ``(2,)``.
-
-    The tilts are 0 elsewhere; the slopes are per sample.
-    """
+def _unit_tilts(lit: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Tilts along x and y ``(2, n, n)`` of rms 1 and mean 0 over the lit samples, 0 elsewhere."""
     tilts = np.where(lit, np.indices(lit.shape)[::-1].astype(float), 0.0)
     tilts[:, lit] -= tilts[:, lit].mean(axis=1, keepdims=True)
-    slopes = 1 / np.sqrt(np.square(tilts[:, lit]).mean(axis=1))
-    return tilts * slopes[:, None, None], slopes
+    return np.asarray(tilts / np.sqrt(np.square(tilts[:, lit]).mean(axis=1))[:, None, None])
 
 
 def _remove(

@@ -76,10 +76,6 @@ class ModulationPath:
         c, s = np.cos(ellipse_angle), np.sin(ellipse_angle)
         return ModulationPath(np.stack([c * along - s * across, s * along + c * across], axis=1))
 
-    def displaced(self, tilt: NDArray[np.float64]) -> ModulationPath:
-        """The path with all points displaced by ``tilt (2,)`` in lambda/D."""
-        return ModulationPath(self.points + tilt)
-
 
 #: Reads duration and positions of an emulated stage's cycle; converts such positions to tilts.
 _CycleReader = Callable[[], tuple[float, NDArray[np.float64]] | None]
