@@ -15,19 +15,23 @@ from escape_gui.widgets.controls import (
     QUALITY_LEVELS,
     Level,
     StatusIndicator,
+    TextArea,
     column,
     flat_button,
     row,
-    text_label,
 )
 from escape_gui.widgets.plots import MARKERS, ConvergencePlot, DriftPlot
 from escape_gui.widgets.profile_plot import ProfilePlot
 from escape_hw.api.registration import PARAMETERS
 from escape_hw.api.results import Estimate
+from escape_hw.calibration.sprint.goodness_of_fit import NOT_JUDGED
 from escape_hw.remote.source import Sample
 from escape_hw.remote.state import State
 from escape_hw.report.tables import format_with_error
 from escape_hw.report.verdict import Quality, assess
+
+#: Lines of warnings and notes that show at once: more would leave no room for the plot.
+_NOTE_LINES = 6
 
 
 class SprintPanel(Panel):
@@ -84,7 +88,7 @@ class SprintPanel(Panel):
             for at, widget in enumerate((marker, self._words[-2], value, self._words[-1])):
                 table.addWidget(widget, k, at)
         table.setColumnStretch(3, 1)
-        self._notes = text_label()
+        self._notes = TextArea(_NOTE_LINES)
         self._notes.hide()
         page = QWidget()
         column(
@@ -150,10 +154,11 @@ class SprintPanel(Panel):
         if verdict is not None and verdict.quality is not Quality.GOOD:
             warnings.insert(0, str(verdict))
         notes = list(self._document.get("registration_notes") or ())
-        self._notes.setText("\n".join([*warnings, *notes]))
-        self._notes.setVisible(bool(warnings or notes))
+        if verdict is not None and "no standard errors" in verdict.reason:
+            notes = [one for one in notes if one != NOT_JUDGED]
+        self._notes.set_text("\n".join([*warnings, *notes]))
         colour = self.context.theme.colour("warn" if warnings else "muted").name()
-        self._notes.setStyleSheet(f"color: {colour};")
+        self._notes.label.setStyleSheet(f"color: {colour};")
 
     def clear(self) -> None:
         self._data.clear()

@@ -28,6 +28,7 @@ from escape_gui.settings import Settings
 from escape_gui.widgets.controls import Level
 from escape_gui.widgets.mode_maps import best_columns
 from escape_hw.api.registration import TO_STREAM_UNITS
+from escape_hw.calibration.sprint.goodness_of_fit import NOT_JUDGED
 from escape_hw.io.documents import calibration_document
 from escape_hw.io.fits.gains import save_gains
 from escape_hw.io.fits.matrix import save_matrix
@@ -347,7 +348,7 @@ def test_sprint_shows_its_iterations_and_its_end(calibrate, source):
     refresh(calibrate)
     assert panel._indicator.text == "converged, 18 iterations"
     assert "±" in panel._values[0].text()
-    assert "tangential_scaling is consistent with zero" in panel._notes.text()
+    assert "tangential_scaling is consistent with zero" in panel._notes.label.text()
     # Runs without a registration do not change the state of the fit.
     for k, name, told in ((4, "push-pull", None), (5, "gains", False)):
         ended = FinishedRun(id=k, name=name, finish=Finish.ABORTED, document={"converged": told})
@@ -564,7 +565,7 @@ def test_a_converged_fit_with_a_noisy_mode_or_a_misfit_is_not_green(calibrate, s
     sprint, procedure = calibrate.panels["sprint"], calibrate.panels["procedure"]
     assert (sprint._indicator.level, sprint._indicator.text) == (Level.WARNING, "converged, 18 iterations")
     line = "Usable: SNR 0.35 in the worst mode"
-    assert line in sprint._notes.text()
+    assert line in sprint._notes.label.text()
     assert line in procedure.verdict.text()
     assert "Pokes clipped: 35 % (350 of 1000)" in procedure.numbers.text()
     calibrate.refresh()
@@ -578,8 +579,30 @@ def test_a_converged_fit_with_a_noisy_mode_or_a_misfit_is_not_green(calibrate, s
     refresh(calibrate)
     words = "converged, but the model does not fit"
     assert (sprint._indicator.level, sprint._indicator.text) == (Level.WARNING, f"{words}, 18 iterations")
-    assert f"Usable: {words} (14% of the matrix" in sprint._notes.text()
-    assert "the model does not fit: 14% of the matrix remain" in sprint._notes.text()
+    assert f"Usable: {words} (14% of the matrix" in sprint._notes.label.text()
+    assert "the model does not fit: 14% of the matrix remain" in sprint._notes.label.text()
     assert f"Usable: {words}" in procedure.verdict.text()
     calibrate.refresh()
     assert f"Usable: {words}" in calibrate.notifications.notifications[-1].text
+
+
+def test_many_notes_leave_room_for_the_convergence(calibrate, source):
+    estimate = fake.registration()
+    path = np.array([step.registration.to_array() for step in estimate.iterations])
+    source.push("registration", path * TO_STREAM_UNITS)
+    source.push("registration_sigma", estimate.sigma * TO_STREAM_UNITS)
+    source.push("step_norm", np.array([step.step_norm for step in estimate.iterations]))
+    notes = [NOT_JUDGED, *(f"note {k} that is long enough to need two lines of the panel" for k in range(12))]
+    document = {
+        **calibration_document(fake.calibration("escape")), "snr": {"min": None}, "model_fits": None,
+        "warnings": [], "registration_notes": notes,
+    }  # fmt: skip
+    source.change(last_run=FinishedRun(id=3, name="escape", finish=Finish.DONE, document=document))
+    refresh(calibrate)
+    sprint = calibrate.panels["sprint"]
+    shown = sprint._notes.label.text()
+    assert shown.count("no standard errors") == 1
+    assert notes[-1] in shown
+    assert sprint._notes.height() <= 6 * sprint._notes.fontMetrics().lineSpacing()
+    assert sprint._notes.verticalScrollBar().maximum() > 0
+    assert sprint.plot.height() > sprint._notes.height()

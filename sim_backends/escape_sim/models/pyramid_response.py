@@ -16,7 +16,6 @@ from escape_sim.optics.fourier_filter import FourierFilter, next_fast_length
 from escape_sim.optics.modulation import ModulationPath
 from escape_sim.optics.pyramid import Prism, frequencies
 
-
 #: Pupil field ``(n, n)``: the amplitude, complex about a wavefront that is not flat.
 _Light = NDArray[np.float32] | NDArray[np.complex64]
 
