@@ -20,7 +20,12 @@ from escape_sim.mirror.mode_surfaces import surface_nodes
 from escape_sim.models.factory import make_fast_model
 from escape_sim.models.pyramid import PyramidModel, nominal_pupils
 from escape_sim.models.pyramid_response import slope_response
-from escape_sim.models.pyramid_turbulence import estimate_strength, sample_distances, unit_screens
+from escape_sim.models.pyramid_turbulence import (
+    estimate_strength,
+    fit_registration_change,
+    sample_distances,
+    unit_screens,
+)
 from escape_sim.oopao import models as oopao_model
 from escape_sim.optics.modulation import ModulationPath
 from escape_sim.optics.pyramid import Prism, PyramidOptics, frequencies
@@ -350,16 +355,35 @@ def test_motion_beyond_the_most_is_as_strong_as_the_most():
     assert estimate_strength(optics, replace(pupils, motion=20.0), screens) == most
 
 
-def test_variants_differ_in_turbulence_modulation_and_the_place_of_the_images(model):
+def test_variants_of_a_calm_sensor_differ_in_modulation_and_the_place_of_the_images():
+    model = PyramidModel(configuration(), nominal_pupils(configuration()))
     here = model.zonal_matrix(INJECTED)
     matrices = [v.zonal_matrix(INJECTED) for v in model.variants()]
-    assert len(matrices) == 5
+    assert len(matrices) == 4
     for one in matrices:
         assert 1e-3 < np.linalg.norm(one - here) / np.linalg.norm(here) < 0.5
     # An ellipse along the axes changes x slopes one way and y slopes the other.
     n = len(here) // 2
-    x, y = (np.linalg.norm(matrices[1][s]) / np.linalg.norm(here[s]) for s in (np.s_[:n], np.s_[n:]))
+    x, y = (np.linalg.norm(matrices[0][s]) / np.linalg.norm(here[s]) for s in (np.s_[:n], np.s_[n:]))
     assert (x - 1) * (y - 1) < 0
+
+
+def test_the_strength_of_open_turbulence_is_not_fitted_but_part_of_the_error(model):
+    assert len(model.variants()) == 2
+    sure = configuration("sensor.turbulence_sigma=1e-6")
+    error, least = (
+        PyramidModel(config, nominal_pupils(config), turbulence=4.0).registration_systematic_error
+        for config in (configuration(), sure)
+    )
+    assert (error > least).all()
+    assert least == pytest.approx(np.zeros(5), abs=1e-4)
+    # What a fit without the true strength errs by, to first order.
+    true = PyramidModel(configuration(), nominal_pupils(configuration()), turbulence=4.0 * 1.4)
+    modes = model._basis()
+    matrix, derivatives = model.modal_jacobian(Registration(), modes)
+    terms = np.concatenate([matrix[None], derivatives[:5]])
+    missed = fit_registration_change(terms, true.modal_matrix(Registration(), modes))
+    assert error == pytest.approx(np.abs(missed), rel=1e-3, abs=1e-6)
 
 
 def test_a_sensor_without_turbulence_has_no_variants_of_its_modulation():

@@ -29,6 +29,7 @@ from escape_sim.models.pyramid_turbulence import (
     PokePhase,
     Turbulence,
     estimate_strength,
+    fit_registration_change,
     sample_distances,
     turbulence_registration_scatter,
 )
@@ -158,13 +159,17 @@ class PyramidModel(DesignModel):
         self._variants: list[PyramidModel] | None = None
         self._shifted_models: dict[tuple[float, float], PyramidModel] = {}
         self._turbulence_scatter: NDArray[np.float64] | None = None
+        self._strength_change: NDArray[np.float64] | None = None
 
     @property
     def registration_systematic_error(self) -> NDArray[np.float64]:
         """Errors by images, turbulence and place of the maps, see :class:`HasSystematicError`."""
         shift = 100 * self._pupils.centre_sigma_px * self._pupil.n_sub / self._pupils.diameter_px
-        images = np.hypot([shift, shift, 0.0, 0.0, 0.0], self._turbulence_uncertainty())
-        return np.asarray(np.hypot(images, super().registration_systematic_error))
+        parts = [
+            np.array([shift, shift, 0.0, 0.0, 0.0]), self._turbulence_uncertainty(),
+            self._strength_uncertainty(), super().registration_systematic_error,
+        ]  # fmt: skip
+        return np.asarray(np.sqrt(np.square(parts).sum(axis=0)))
 
     @property
     def gain_trend(self) -> float:
@@ -277,24 +282,39 @@ class PyramidModel(DesignModel):
         return self._shifted_models[position]
 
     def variants(self) -> list[PyramidModel]:
-        """Models with stronger turbulence, elliptic modulation, or displaced images."""
+        """Models with displaced images; unless it averages an open loop, also with other conditions.
+
+        These are stronger turbulence and elliptic modulation. The finite number of wavefronts in an open loop
+        changes the response by more than they do: a fit of them would follow it to many times their priors,
+        and the registration with them. There the strength is part of the systematic error, and an ellipse
+        changes nothing that matters.
+        """
         if self._variants is None:
-            changes: list[PyramidModel] = []
             section = self._config.sensor_as(PyramidSection)
-            if self.turbulence:
-                changes.append(self._variant(turbulence=self.turbulence * (1 + section.turbulence_sigma)))
-            radius = self._pupils.modulation
-            for angle in (0.0, np.pi / 4) if radius else ():
-                elliptic = ModulationPath.circle(
-                    radius, ellipse=section.ellipticity_sigma, ellipse_angle=angle
-                )
-                changes.append(self._variant(modulation=elliptic))
+            changes = [] if self._in_open_turbulence else self._other_conditions()
             for axis in range(2):
                 centres = self._pupils.centres_px.copy()
                 centres[:, axis] += section.image_position_sigma_px * _DIAGONALS
                 changes.append(self._variant(pupils=replace(self._pupils, centres_px=centres)))
             self._variants = changes
         return list(self._variants)
+
+    @property
+    def _in_open_turbulence(self) -> bool:
+        return bool(self.turbulence) and self._phases.stationary
+
+    def _other_conditions(self) -> list[PyramidModel]:
+        """Models with stronger turbulence, where there is any, and with elliptic modulation."""
+        section, radius = self._config.sensor_as(PyramidSection), self._pupils.modulation
+        models = [self._with_more_turbulence()] if self.turbulence else []
+        for angle in (0.0, np.pi / 4) if radius else ():
+            elliptic = ModulationPath.circle(radius, ellipse=section.ellipticity_sigma, ellipse_angle=angle)
+            models.append(self._variant(modulation=elliptic))
+        return models
+
+    def _with_more_turbulence(self) -> PyramidModel:
+        section = self._config.sensor_as(PyramidSection)
+        return self._variant(turbulence=self.turbulence * (1 + section.turbulence_sigma))
 
     # ------------------------------------------------------------------ construction
     def _variant(
@@ -310,6 +330,18 @@ class PyramidModel(DesignModel):
             turbulence=self.turbulence if turbulence is None else turbulence, basis=self._modes,
             phases=self._phases, mean_phase=self.mean_phase,
         )  # fmt: skip
+
+    def _strength_uncertainty(self) -> NDArray[np.float64]:
+        """Registration error ``(5,)`` by the strength of the turbulence, where it is not fitted."""
+        if not self._in_open_turbulence:
+            return np.zeros(5)
+        if self._strength_change is None:
+            modes = self._basis()
+            matrix, derivatives = self.modal_jacobian(Registration(), modes)
+            stronger = self._with_more_turbulence().modal_matrix(Registration(), modes)
+            terms = np.concatenate([matrix[None], derivatives[:5]])
+            self._strength_change = fit_registration_change(terms, stronger)
+        return self._strength_change
 
     def _turbulence_uncertainty(self) -> NDArray[np.float64]:
         """Registration error ``(5,)`` by the finite number of turbulence and poke states averaged."""

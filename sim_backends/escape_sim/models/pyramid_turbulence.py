@@ -361,7 +361,7 @@ def turbulence_registration_scatter(
         measured = np.stack(slopes, axis=1)
         fits.append(
             [
-                _fit_registration(terms[:, :, g::_N_GROUPS], measured[:, g::_N_GROUPS])
+                fit_registration_change(terms[:, :, g::_N_GROUPS], measured[:, g::_N_GROUPS])
                 for g in range(_N_GROUPS)
             ]
         )
@@ -376,8 +376,11 @@ def turbulence_registration_scatter(
     return np.asarray(np.sqrt(np.maximum(common_variance, _MIN_SHARE * total_variance)))
 
 
-def _fit_registration(terms: NDArray[np.float64], slopes: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Registration ``(5,)`` from slopes ``(n_slopes, k)`` by matrix and derivatives ``(6, n_slopes, k)``."""
+def fit_registration_change(terms: NDArray[np.float64], slopes: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Change of the registration ``(5,)`` that fits slopes ``(n_slopes, k)`` best, with a gain.
+
+    ``terms (6, n_slopes, k)`` are a matrix and its derivatives by the registration.
+    """
     design = terms.reshape(6, -1)
     gain, *shifts = np.linalg.lstsq(design @ design.T, design @ slopes.ravel())[0]
     return np.asarray(np.array(shifts) / gain)
