@@ -14,8 +14,8 @@ from escape_hw.runtime.session.system import System
 
 #: Scripts that only print, if their raw table has all realisations.
 SCRIPTS = (
-    "capture_range", "closed_loop_response", "constants", "lenslet_pokes", "neighbouring_spots", "nuisances",
-    "registration_errors", "tracked_realisations",
+    "capture_range", "closed_loop_response", "constants", "lenslet_pokes", "mean_wavefront",
+    "neighbouring_spots", "nuisances", "registration_errors", "tracked_realisations",
 )  # fmt: skip
 COMMAND = re.compile(
     rf"^python (benchmarks/studies/[a-z]+/(?:{'|'.join(SCRIPTS)})\.py .*--out docs/.*)$", re.MULTILINE

@@ -94,7 +94,10 @@ def test_the_matrix_it_fits_answers_as_the_bench_does():
 def test_the_pyramid_has_gains_by_mode():
     with small_pyramid("twin.loss_probability=0") as bench:
         truth = bench.dm.twin.flexure.at(0.0)
-        found, start = looked(bench, 4, 303, n_curve_coefficients=3, start_frames=900)
+        # The sensor is more sensitive in closed loop than in the turbulence of the matrix.
+        found, start = looked(
+            bench, 4, 303, gain=lambda n: np.full(n, 0.15), n_curve_coefficients=3, start_frames=900
+        )
         with pytest.raises(TooFewFrames, match="at least 50"):
             looked(bench, 1, 40, start=start)
     errors, pulls = errors_and_pulls(found, truth)

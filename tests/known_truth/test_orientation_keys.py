@@ -102,6 +102,6 @@ def test_a_table_is_not_replaced_by_a_flip() -> None:
 def test_the_key_of_a_pyramids_camera_is_named() -> None:
     """A flip exchanges the pupil images as well."""
     with small_pyramid.small("twin.wfs.flip=turn-90") as bench:
-        found = bench.calibrate("escape", frames=400).registration
+        found = bench.calibrate("escape", frames=900).registration
     assert found is not None
     assert any("devices.wfs.flip = 'turn-90'" in warning for warning in found.warnings), found.warnings
