@@ -552,12 +552,17 @@ def test_without_control_nothing_starts(session, source, control, form):
     assert isinstance(control, ScriptedControl)
 
 
-def test_a_converged_fit_with_a_noisy_mode_or_a_misfit_is_not_green(calibrate, source):
+def push_convergence(source):
+    """The iterations of a fit that has ended."""
     estimate = fake.registration()
     path = np.array([step.registration.to_array() for step in estimate.iterations])
     source.push("registration", path * TO_STREAM_UNITS)
     source.push("registration_sigma", estimate.sigma * TO_STREAM_UNITS)
     source.push("step_norm", np.array([step.step_norm for step in estimate.iterations]))
+
+
+def test_a_converged_fit_with_a_noisy_mode_or_a_misfit_is_not_green(calibrate, source):
+    push_convergence(source)
     document = {**calibration_document(fake.calibration("escape")), "snr": {"min": 0.35, "median": 9.0}}
     document |= {"warnings": [], "clipped_pokes": 350, "frames": 1000}
     source.change(last_run=FinishedRun(id=3, name="escape", finish=Finish.DONE, document=document))
@@ -587,11 +592,7 @@ def test_a_converged_fit_with_a_noisy_mode_or_a_misfit_is_not_green(calibrate, s
 
 
 def test_many_notes_leave_room_for_the_convergence(calibrate, source):
-    estimate = fake.registration()
-    path = np.array([step.registration.to_array() for step in estimate.iterations])
-    source.push("registration", path * TO_STREAM_UNITS)
-    source.push("registration_sigma", estimate.sigma * TO_STREAM_UNITS)
-    source.push("step_norm", np.array([step.step_norm for step in estimate.iterations]))
+    push_convergence(source)
     notes = [NOT_JUDGED, *(f"note {k} that is long enough to need two lines of the panel" for k in range(12))]
     document = {
         **calibration_document(fake.calibration("escape")), "snr": {"min": None}, "model_fits": None,

@@ -190,8 +190,10 @@ def test_mean_derivatives_are_those_of_frames_under_turbulence(ratio):
 @pytest.mark.parametrize(("samples", "normalisation"), [(1, "global"), (2, "local")])
 def test_all_pairs_give_what_the_convolution_gives(samples, normalisation, path):
     bare = Bare(samples, normalisation)
-    if path == "no symmetry":
-        bare.modulation = ModulationPath(np.array([[1.0, 0.2], [-0.5, 1.4], [0.3, -2.0]]))
+    bare.modulation = {
+        "ellipse": ModulationPath.circle(3.0, ellipse=0.1),
+        "no symmetry": ModulationPath(np.array([[1.0, 0.2], [-0.5, 1.4], [0.3, -2.0]])),
+    }[path]
     n = len(bare.light)
     structure = Screens(n, 5.0).structure()
     rows, columns = np.nonzero(bare.light)

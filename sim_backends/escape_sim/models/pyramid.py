@@ -23,7 +23,7 @@ from escape_sim.mirror.mode_surfaces import (
     surface_nodes,
 )
 from escape_sim.models.base import DesignModel
-from escape_sim.models.pyramid_mean_phase import coarse_pupils, estimate_mean_phase
+from escape_sim.models.pyramid_mean_phase import coarse_pixels, estimate_mean_phase
 from escape_sim.models.pyramid_response import SlopeResponse, slope_response
 from escape_sim.models.pyramid_turbulence import (
     PokePhase,
@@ -405,7 +405,7 @@ class PyramidModel(DesignModel):
 
     def _estimate_mean_phase(self) -> NDArray[np.float64]:
         """Mean phase ``(n, n)`` during the measurement, from its mean slopes."""
-        radius_m, pixels = self._config.system.pupil_m / 2, coarse_pupils(self._pupils)
+        radius_m, pixels = self._config.system.pupil_m / 2, coarse_pixels(self._pupils.valid)
         return estimate_mean_phase(
             self._slope_response(pixels), pixels, self._pupils, self._nodes / radius_m,
             self._pupil.coordinates_m / radius_m,

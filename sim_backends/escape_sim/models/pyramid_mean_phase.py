@@ -18,10 +18,10 @@ from escape_sim.models.pyramid_response import SlopeResponse
 _STRIDE = 3
 
 
-def coarse_pupils(pupils: PyramidPupils) -> NDArray[np.bool_]:
-    """The valid pixels ``(n, n)`` that suffice for the low orders."""
-    coarse = np.zeros_like(pupils.valid)
-    coarse[::_STRIDE, ::_STRIDE] = pupils.valid[::_STRIDE, ::_STRIDE]
+def coarse_pixels(valid: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Those of the valid pixels ``(n, n)`` that suffice for the low orders."""
+    coarse = np.zeros_like(valid)
+    coarse[::_STRIDE, ::_STRIDE] = valid[::_STRIDE, ::_STRIDE]
     return coarse
 
 

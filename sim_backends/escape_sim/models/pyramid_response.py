@@ -98,17 +98,15 @@ class PairwiseCorrelations:
         self._kernel, self._lit = kernel, lit
         self._rows, self._columns = np.nonzero(lit)
         at = np.stack([self._columns, self._rows], axis=1) * (2 * np.pi / diameter)
-        # About its centre a circle or an ellipse is symmetric, and its coherence real.
-        centre = modulation.points.mean(axis=0)
-        tilts = np.exp(1j * at @ (modulation.points - centre).T) * np.sqrt(modulation.weight)
+        tilts = np.exp(1j * at @ modulation.points.T) * np.sqrt(modulation.weight)
         coherence = tilts.conj() @ tilts.T
+        # A circle or an ellipse is symmetric, and its coherence real.
         if np.abs(coherence.imag).max() < _NEGLIGIBLE_PART:
             coherence = coherence.real
         single = np.float32 if np.isrealobj(coherence) else np.complex64
         # Characteristic function of a Gaussian phase.
         self._coherence = coherence.astype(single) * np.exp(np.float32(-0.5) * structure)
-        self._tilt = np.exp(1j * at @ centre).astype(np.complex64)
-        self._light = (light[lit] * self._tilt).conj()
+        self._light = light[lit].conj()
 
     def correlations(self, pixels: NDArray[np.intp]) -> Iterator[NDArray[np.complex64]]:
         """Yield ``n`` rows of ``n`` samples for each (row, column) ``u`` in ``pixels``."""
@@ -120,7 +118,6 @@ class PairwiseCorrelations:
             products = parts[:count] + 1j * parts[count:]
         else:
             products = fields @ self._coherence
-        products *= self._tilt
         result = np.zeros((n, n), np.complex64)
         for product in products:
             result[self._lit] = product
@@ -186,7 +183,7 @@ def _add_pixel_response(kernel, row, column, light, correlations, spans, weights
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SlopeResponse:
-    """Slopes of a mean wavefront ``mean (n_slopes,)``, all x then all y, and their derivatives.
+    """Mean slopes ``mean (n_slopes,)``, all x then all y, and their derivatives.
 
     ``phase_derivatives (n_slopes, m * m)`` are by the phase at the nodes, rows along y, in 1 / rad.
     """
