@@ -25,7 +25,7 @@ from escape_hw.api.registration import PARAMETERS
 from escape_hw.report.figures.style import SERIES, new_figure, style_axes
 
 #: Realisations of a case. No constant and no method was chosen on them, and none was looked at before.
-REALISATIONS = range(13000, 13020)
+REALISATIONS = range(14000, 14020)
 #: The mirror of the bundled benches until version 0.2.0.
 GAUSSIAN = (
     "devices.dm.influence=gaussian", "devices.dm.coupling=0.4", "twin.mirror.shape=gaussian",
