@@ -14,6 +14,7 @@ from pydantic import Field
 import escape_hw
 from escape_drivers.common.options import section_options
 from escape_hw.config.layouts import layout_map
+from escape_hw.config.options import parse_options
 from escape_hw.config.section import Section
 from escape_hw.errors import FrameTimeout, NotOpen, SettingRejected
 from escape_hw.safety.limits import CAUTIOUS_LIMITS
@@ -116,7 +117,7 @@ class AcmeCamera(escape_hw.Camera):
         super().__init__(name)
         self._info = escape_hw.CameraInfo("Acme 640", serial, (512, 640), 12, simulated=True)
         self._settings = escape_hw.CameraSettings(escape_hw.Region(*region), exposure_s, frame_rate_hz)
-        self._options = AcmeOptions(**options)
+        self._options = parse_options(AcmeOptions, name, options)
         self._sensor: AcmeSensor | None = None
 
     @classmethod

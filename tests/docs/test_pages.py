@@ -71,9 +71,18 @@ def test_a_quotation_is_compared_with_the_output() -> None:
     assert len(differences("Shift X [%] −16.036 ± 0.090  −0.7  −16", printed)) == 1
 
 
-@pytest.mark.campaign
 @pytest.mark.timeout(3600)
-@pytest.mark.parametrize("page", [page for page in RUN if has_slow_blocks(page)], ids=name_of)
+@pytest.mark.parametrize(
+    "page",
+    [
+        pytest.param(
+            page, marks=pytest.mark.slow if name_of(page) == "tutorial/telescope.md" else pytest.mark.campaign
+        )
+        for page in RUN
+        if has_slow_blocks(page)
+    ],
+    ids=name_of,
+)
 def test_a_page_can_be_followed_to_its_end(
     page: Path, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> None:

@@ -103,7 +103,7 @@ def test_a_fit_of_a_thin_plate_is_right_within_its_errors_or_says_that_it_failed
     assert np.abs(errors / found.sigma).max() < 3
 
 
-@pytest.mark.campaign
+@pytest.mark.slow
 @pytest.mark.timeout(1800)
 def test_ten_registrations_from_fifty_and_a_thousand_frames() -> None:
     """The paper's goal from a tenth of its frames and less, with correct errors of every parameter."""

@@ -9,6 +9,7 @@ import ctypes
 import os
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -35,28 +36,23 @@ SHAPES = [(6,), (5, 7), (3, 3), (4, 3, 2), (48, 64)]
 DTYPES = [dtype.str for dtype in layout.DTYPES.values()]
 
 
+@pytest.fixture(scope="module")
+def folder() -> Iterator[Path]:
+    """A folder of these tests, whatever MILK_SHM_DIR says: that is where the images of a site are."""
+    with tempfile.TemporaryDirectory(prefix="escape_test_", dir="/dev/shm") as path:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setenv("MILK_SHM_DIR", path)
+            yield Path(path)
+
+
 @pytest.fixture
-def library(tmp_path: Path) -> Iterator[Any]:
+def library(folder: Path) -> Iterator[Any]:
     # The library reads the folder once in its life, so all tests share one; and it changes the umask.
-    folder, umask = _folder(), os.umask(0o022)
+    umask = os.umask(0o022)
     yield ctypes.CDLL(milk_peer.NAME)
     os.umask(umask)
     for path in folder.glob("*.im.shm"):
         path.unlink()
-
-
-def _folder() -> Path:
-    folder = Path(os.environ.setdefault("MILK_SHM_DIR", f"/dev/shm/escape_test_{os.getpid()}"))
-    folder.mkdir(exist_ok=True)
-    return folder
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _no_folder_left() -> Iterator[None]:
-    before = os.environ.get("MILK_SHM_DIR")
-    yield
-    if before is None and "MILK_SHM_DIR" in os.environ:
-        Path(os.environ.pop("MILK_SHM_DIR")).rmdir()
 
 
 @pytest.fixture

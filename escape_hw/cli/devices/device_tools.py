@@ -29,6 +29,13 @@ class DeviceCommand(TyperCommand):
             args = ["", *args]
         return super().parse_args(ctx, args)
 
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        """Write the help, which does not call the system required: its text says when it is."""
+        for parameter in self.params:
+            if parameter.name == "system":
+                parameter.required = False
+        super().format_help(ctx, formatter)
+
 
 @dataclass(frozen=True)
 class SelectedDevice(Generic[D]):
