@@ -55,7 +55,7 @@ def bench(holder: Connection) -> Iterator[Connection]:
 
 @pytest.fixture(scope="module")
 def matrix(holder: Connection) -> str:
-    """Name of a matrix that the server made; set up before ``bench``, whatever test took control or let it go."""
+    """Name of a matrix that the server made. It is set up before ``bench``, whoever has control."""
     holder.acquire(take_over=True)
     run = holder.start("docrime", frames=1000)
     run.wait(120)

@@ -39,10 +39,12 @@ DTYPES = [dtype.str for dtype in layout.DTYPES.values()]
 @pytest.fixture(scope="module")
 def folder() -> Iterator[Path]:
     """A folder of these tests, whatever MILK_SHM_DIR says: that is where the images of a site are."""
-    with tempfile.TemporaryDirectory(prefix="escape_test_", dir="/dev/shm") as path:
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setenv("MILK_SHM_DIR", path)
-            yield Path(path)
+    with (
+        tempfile.TemporaryDirectory(prefix="escape_test_", dir="/dev/shm") as path,
+        pytest.MonkeyPatch.context() as patch,
+    ):
+        patch.setenv("MILK_SHM_DIR", path)
+        yield Path(path)
 
 
 @pytest.fixture
