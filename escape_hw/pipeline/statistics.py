@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import special
 
+#: Ratio of the standard deviation of a normal variable to its median absolute deviation.
+NORMAL_RATIO = 1.4826
 #: Fewest values from which a correlation is estimated.
 MIN_SAMPLES = 10
 #: Statistical error of the window over its systematic one (Wolff 2004, S).

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from escape_hw.api.representation import short_repr
 from escape_hw.pipeline.control.integrator import gain_limit
+from escape_hw.pipeline.statistics import NORMAL_RATIO
 
 #: Shortest and longest segment of a spectrum in frames, and number of segments (without overlap) to aim at.
 _MIN_SEGMENT, _MAX_SEGMENT, _N_SEGMENTS = 64, 4096, 4
@@ -183,7 +184,7 @@ def suspicious_subapertures(slopes: NDArray[np.floating]) -> list[SuspiciousElem
     )
     mean = axes.mean(axis=0)
     offset = np.hypot(*(mean - np.median(mean, axis=1, keepdims=True)))
-    limit = max(_OUTLIER_SIGMA * 1.4826 * float(np.median(offset)), float(np.median(rms)))
+    limit = max(_OUTLIER_SIGMA * NORMAL_RATIO * float(np.median(offset)), float(np.median(rms)))
     found += [
         SuspiciousElement("sub-aperture", int(k), f"mean slope off by {offset[k]:.2g}",
                           float(offset[k] / limit))
@@ -199,7 +200,7 @@ def _still_or_wild(kind: str, rms: NDArray[np.floating], still: str, wild: str) 
         return []
     ratio = rms / median
     logs = np.log(np.maximum(ratio, 1e-9))
-    scatter = max(1.4826 * float(np.median(np.abs(logs))), _MIN_SCATTER)
+    scatter = max(NORMAL_RATIO * float(np.median(np.abs(logs))), _MIN_SCATTER)
     limit = float(np.exp(_OUTLIER_SIGMA * scatter))
     found = [SuspiciousElement(kind, int(k), still, 1e3) for k in np.flatnonzero(ratio < _STILL)]
     return found + [

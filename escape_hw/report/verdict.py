@@ -85,12 +85,8 @@ def _problems(document: Mapping[str, Any]) -> Iterator[Verdict]:
             describe_outcome(True, False) + _describe_residual(document),
             "the notes name what does not fit, and the standard errors contain it",
         )
-    elif document.get("converged") and document.get("model_fits", True) is None and _has_no_noise(document):
-        yield Verdict(
-            Quality.USABLE,
-            "converged, but the matrix has no standard errors, so whether the model fits is not judged",
-            "state its noise if it is known (matrix.sigma of 'escape import arrays')",
-        )
+    elif document.get("converged") and document.get("model_fits", True) is None:
+        yield _not_judged(document)
     for criterion in _mappings(document.get("criteria")):
         text = str(criterion.get("text"))
         # Alarms are judged below.
@@ -109,16 +105,26 @@ def _problems(document: Mapping[str, Any]) -> Iterator[Verdict]:
         yield Verdict(Quality.USABLE, f"{many}: {alarms[-1].get('text', '')}", "see the report")
 
 
-def _has_no_noise(document: Mapping[str, Any]) -> bool:
-    """Whether the matrix is there without standard errors."""
+def _not_judged(document: Mapping[str, Any]) -> Verdict:
+    """That a converged registration is not judged, and how it would be."""
     snr = _mapping(document.get("snr"))
-    return "min" in snr and not _is_number(snr["min"])
+    if "min" in snr and not _is_number(snr["min"]):
+        return Verdict(
+            Quality.USABLE,
+            "converged, but the matrix has no standard errors, so whether the model fits is not judged",
+            "state its noise if it is known (matrix.sigma of 'escape import arrays')",
+        )
+    return Verdict(
+        Quality.USABLE,
+        "converged, but whether the model fits is not judged",
+        "measure more frames, in open loop",
+    )
 
 
 def _describe_residual(document: Mapping[str, Any]) -> str:
     """What a model that does not fit leaves, in brackets."""
     misfit, chi2 = document.get("misfit"), document.get("chi2")
-    if not _is_number(misfit) or not _is_number(chi2):
+    if not _is_number(misfit) or not _is_number(chi2) or not misfit:
         return ""
     return f" ({misfit:.0%} of the matrix beyond its noise, reduced chi-squared {chi2:.3g})"
 

@@ -8,7 +8,12 @@ from small_system import GAUSSIAN_TWIN, configuration
 
 from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.results import CalibrationResult
-from escape_hw.calibration.sprint.telemetry_fit import decorrelate_columns, telemetry_from_frames
+from escape_hw.calibration.sprint.telemetry_fit import (
+    MIN_WHITENED_FRAMES,
+    WhitenedFrames,
+    decorrelate_columns,
+    telemetry_from_frames,
+)
 from escape_hw.errors import TooFewFrames
 from escape_hw.paper.sky_time import GOAL, random_registration, registration_overrides
 from escape_hw.runtime.session.system import System, open_system
@@ -99,6 +104,26 @@ def test_turned_columns_hold_the_likelihood():
         # Fewer frames than modes: the turned matrix reproduces every frame, so nothing is left over.
         assert by_columns == pytest.approx(by_frames, rel=1e-4)
     np.testing.assert_allclose(turned.sigma, 0.1, rtol=1e-6)
+
+
+def test_the_noise_is_known_without_a_model_from_more_frames_than_modes():
+    """The variance about a least-squares matrix is that of the noise, whatever the matrix."""
+    rng = np.random.default_rng(4)
+    n_slopes, n_modes, n = 40, 9, 60
+    pokes, deviation = rng.standard_normal((n, n_modes)), rng.uniform(0.5, 2.0, n_slopes)
+    slopes = 5 * pokes @ rng.standard_normal((n_modes, n_slopes)) + deviation * rng.standard_normal(
+        (n, n_slopes)
+    )
+    slopes, pokes = slopes - slopes.mean(axis=0), pokes - pokes.mean(axis=0)
+
+    def noise(first: int, closed: bool = False):
+        commands = pokes[None, :first]
+        frames = WhitenedFrames(slopes[:first], commands, commands.copy() if closed else commands)
+        return frames.pure_error(np.ones(1))
+
+    assert np.mean(noise(n) / deviation**2) == pytest.approx(1.0, abs=0.08)
+    assert noise(n, closed=True) is None
+    assert noise(n_modes + MIN_WHITENED_FRAMES) is None
 
 
 def test_lost_frames_keep_the_last_poke_and_lose_no_other():

@@ -43,10 +43,10 @@ def test_a_model_that_does_not_fit_is_told(signal: float, misfit: float, noise: 
     weighted, rng = weighted_matrix(signal), np.random.default_rng(1)
     residual = noise * rng.standard_normal(weighted.data.shape)
     residual += signal * misfit * rng.standard_normal(residual.shape)
-    found = assess_fit(weighted, residual)
+    found = assess_fit(weighted, residual, {})
     assert found is not None
     assert found.fits is fits
-    notes = describe_misfit(weighted, residual)
+    notes = describe_misfit(weighted, residual, {})
     assert len(notes) == (not fits)
     if not fits:
         assert found.misfit == pytest.approx(misfit, rel=0.1)
@@ -59,7 +59,7 @@ def test_correlated_noise_of_a_few_columns_is_no_misfit() -> None:
     pattern = np.tile(np.cos(np.linspace(0, 6, 36)), 2) * np.sqrt(2)
     residual = np.outer(pattern, rng.standard_normal(N_MODES))
     assert Misfit.of(weighted, residual).excess_sigma > 0.1
-    found = assess_fit(weighted, residual)
+    found = assess_fit(weighted, residual, {})
     assert found is not None
     assert found.fits
 
@@ -70,7 +70,7 @@ def test_slopes_with_a_small_weight_do_not_hide_a_misfit() -> None:
     weighted = weighted_matrix(100.0).with_slope_weights(weights)
     residual = np.sqrt(weights)[:, None] * rng.standard_normal(weighted.data.shape)
     assert weighted.reduced_chi_squared(residual) == pytest.approx(1.0, abs=0.1)
-    found = assess_fit(weighted, residual)
+    found = assess_fit(weighted, residual, {})
     assert found is not None
     assert found.by_sub_aperture == pytest.approx(1.0, abs=0.4)
     assert found.by_actuator == pytest.approx(1.0, abs=0.4)
@@ -79,8 +79,21 @@ def test_slopes_with_a_small_weight_do_not_hide_a_misfit() -> None:
 def test_a_matrix_without_standard_errors_is_not_judged() -> None:
     weighted = replace(weighted_matrix(100.0), has_standard_errors=False)
     residual = 5 * np.random.default_rng(1).standard_normal(weighted.data.shape)
-    assert assess_fit(weighted, residual) is None
-    assert describe_misfit(weighted, residual) == (NOT_JUDGED,)
+    assert assess_fit(weighted, residual, {}) is None
+    assert describe_misfit(weighted, residual, {}) == (NOT_JUDGED,)
+
+
+@pytest.mark.parametrize("has_standard_errors", [True, False])
+def test_effects_that_scatter_by_more_than_their_priors_can_are_a_misfit(has_standard_errors: bool) -> None:
+    weighted = replace(weighted_matrix(100.0), has_standard_errors=has_standard_errors)
+    residual = np.random.default_rng(1).standard_normal(weighted.data.shape)
+    excess = {"actuator_gain": 2.8, "sampling": 1.3}
+    found = assess_fit(weighted, residual, excess)
+    assert found is not None
+    assert found.fits is False
+    note = describe_misfit(weighted, residual, excess)[0]
+    assert "the gains of the actuators (2.8 times)" in note
+    assert "contain a factor of 2.8" in note
 
 
 def test_the_worst_parts_are_named() -> None:
@@ -91,7 +104,7 @@ def test_the_worst_parts_are_named() -> None:
     named = describe_outliers(weighted, residual)
     assert "sub-apertures (row, column) (1, 1)" in named
     assert "actuators 3" in named
-    found = assess_fit(weighted, residual)
+    found = assess_fit(weighted, residual, {})
     assert found is not None
     assert int(found.by_sub_aperture.argmax()) == 7
     assert int(found.by_actuator.argmax()) == 3

@@ -26,7 +26,12 @@ ESCAPE = {"converged": True, "iterations": 15, "frames": 600, "snr": {"min": 23.
             "chi-squared 22.4); the notes name what does not fit",
         ),
         ({"converged": False, "model_fits": False}, Quality.NOT_USABLE, "Not usable: not converged"),
-        ({"model_fits": None}, Quality.GOOD, "Good: SNR 23.8"),
+        ({"model_fits": None}, Quality.USABLE, "Usable: converged, but whether the model fits is not judged"),
+        (
+            {"model_fits": False, "misfit": 0.0, "chi2": 1.0},
+            Quality.USABLE,
+            "the model does not fit; the notes",
+        ),
         (
             {"model_fits": None, "snr": {"min": None}},
             Quality.USABLE,

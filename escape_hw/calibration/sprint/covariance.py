@@ -203,7 +203,10 @@ def _jackknife_covariance(steps: list[NDArray[np.float64]]) -> NDArray[np.float6
 
 
 def sandwich_covariance(
-    weighted: WeightedMatrix, system: LinearisedProblem, noise: NDArray[np.float64] | None
+    weighted: WeightedMatrix,
+    system: LinearisedProblem,
+    noise: NDArray[np.float64] | None,
+    least_factor: float = 1.0,
 ) -> NDArray[np.float64]:
     """Sandwich covariance of the common parameters, in their units.
 
@@ -232,6 +235,8 @@ def sandwich_covariance(
         The measured matrix, and the problem linearised at its solution.
     noise
         Covariance of the noise of the slopes ``(n_slopes, n_slopes)`` up to a factor, where it is known.
+    least_factor
+        Factor of the standard errors for a misfit that is seen elsewhere than in the residual.
     """
     bread = np.linalg.inv(system.information())
     scores, valid = system.projected_jacobian(), weighted.valid
@@ -259,5 +264,5 @@ def sandwich_covariance(
         np.diag(_resampled_by_slopes(information, scores, system.residual, valid)),
         np.diag(_resampled_covariance(information, scores, system.residual, weighted.modes)),
     )
-    scale_factor = max(weighted.reduced_chi_squared(system.residual) / power, 1.0)
+    scale_factor = max(weighted.reduced_chi_squared(system.residual) / power, least_factor**2)
     return _with_variances(covariance, np.max(estimates, axis=0) * scale_factor)

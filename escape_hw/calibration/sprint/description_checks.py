@@ -17,7 +17,7 @@ from escape_hw.calibration.sprint.mixed_effects import MixedEffectsState
 from escape_hw.calibration.sprint.normal_equations import NormalEquations
 from escape_hw.calibration.sprint.weighted_matrix import WeightedMatrix
 
-#: Relative gain beyond the common one below which an actuator or sub-aperture is named: half of the others.
+#: Relative gain below which an actuator (beyond the median one) or sub-aperture is named: half of the others.
 _HARDLY_RESPONDS = -0.5
 #: Scalings in % of the same sign, and difference between the gains of x and y slopes, from which on they are
 #: named. They are correct results, so this limits what is displayed and nothing else.
@@ -46,7 +46,8 @@ def describe_description(
         )
     if state is None:
         return notes
-    weak = np.flatnonzero(state.actuator_gain < _HARDLY_RESPONDS)
+    response = 1 + state.actuator_gain
+    weak = np.flatnonzero(response < (1 + _HARDLY_RESPONDS) * np.median(response))
     if weak.size:
         notes.append(
             f"actuators that hardly respond: {_list([str(a) for a in weak])}; check the mirror, the cables "

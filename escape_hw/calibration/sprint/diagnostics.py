@@ -97,7 +97,11 @@ _ORIENTATIONS: dict[Flip, str] = {
     "transpose": "transposed",
     "anti-transpose": "transposed about the other diagonal",
 }
+#: Words of the hints, by which they are recognised.
+ORIENTATION_HINT = "the sensor saw the pupil"
 _ITERATIONS = 10
+#: Standard errors of the fitted matrix by which another orientation must explain more than the described one.
+_SIGNIFICANT = 10.0
 
 
 def check_orientation(
@@ -119,7 +123,7 @@ def check_orientation(
         if gain is not None:
             sign = " and the polarity were reversed" if gain < 0 else ""
             remedy = suggest_orientation(model, flip, opposite=gain < 0)
-            return f"it would if the sensor saw the pupil {_ORIENTATIONS[flip]}{sign}: {remedy}"
+            return f"it would if {ORIENTATION_HINT} {_ORIENTATIONS[flip]}{sign}: {remedy}"
     if _gain_of_fit(_exchange_slopes(weighted), model) is not None:
         return (
             "it would if its x slopes were its y slopes: check the order of the slopes (matrix.slopes of the "
@@ -133,6 +137,41 @@ def check_orientation(
             f"(sensor.sign_{axis} of the description in 'escape import arrays')"
         )
     return None
+
+
+def find_better_orientation(
+    matrix: InteractionMatrix, model: SyntheticModel, columns: NDArray[np.intp], alpha: NDArray[np.float64]
+) -> str | None:
+    """Find a flip, quarter turn or transposition that explains significantly more than the description.
+
+    Random effects may fit a mirrored pupil, and the signal of few frames may be too small for
+    :func:`check_orientation`. So gain and registration alone are fitted to all columns in every orientation.
+
+    Returns
+    -------
+    str or None
+        As for :func:`check_orientation`. ``alpha``: registration ``(5,)`` that was found.
+    """
+    if not isinstance(model, DifferentiableModel):
+        return None
+    weighted = WeightedMatrix.from_columns(matrix, columns)
+    described = max(_explained_by_fit(weighted, model, start) for start in (alpha, np.zeros(5)))
+    explained = {
+        flip: _explained_by_fit(reoriented, model, np.zeros(5)) for flip, reoriented in _reoriented(weighted)
+    }
+    best = max(explained, key=lambda flip: explained[flip])
+    if explained[best] < described + _SIGNIFICANT**2 * weighted.noise_level(weighted.data) ** 2:
+        return None
+    remedy = suggest_orientation(model, best)
+    return f"it would explain more if {ORIENTATION_HINT} {_ORIENTATIONS[best]}: {remedy}"
+
+
+def _explained_by_fit(
+    weighted: WeightedMatrix, model: DifferentiableModel, start: NDArray[np.float64]
+) -> float:
+    """Sum of squares that a registration-only fit of positive gain explains, 0 without one."""
+    *_, fit = LeastSquaresProblem(weighted, model).descend(start, _ITERATIONS)
+    return float(np.square(weighted.data).sum() - np.square(fit.residual).sum()) if fit.gain > 0 else 0.0
 
 
 def _gain_of_fit(weighted: WeightedMatrix, model: DifferentiableModel) -> float | None:

@@ -22,7 +22,11 @@ from escape_hw.api.synthetic_model import SyntheticModel
 from escape_hw.calibration.modes.derivatives import modal_matrix
 from escape_hw.calibration.sprint.covariance import sandwich_covariance, systematic_error
 from escape_hw.calibration.sprint.description_checks import describe_description, estimate_clocking
-from escape_hw.calibration.sprint.diagnostics import describe_degeneracies
+from escape_hw.calibration.sprint.diagnostics import (
+    ORIENTATION_HINT,
+    describe_degeneracies,
+    find_better_orientation,
+)
 from escape_hw.calibration.sprint.extra_parameters import build_extra_parameters
 from escape_hw.calibration.sprint.goodness_of_fit import assess_fit, check_fit, describe_misfit
 from escape_hw.calibration.sprint.influence_estimate import estimate_profile
@@ -410,11 +414,12 @@ def _build_estimate(
     noise: NDArray[np.float64] | None,
 ) -> RegistrationEstimate:
     """Add standard errors, notes and warnings to a solution."""
-    covariance = sandwich_covariance(weighted, solution.system, noise)
+    residual, excess = solution.system.residual, solution.excess_scatters
+    covariance = sandwich_covariance(weighted, solution.system, noise, max([1.0, *excess.values()]))
     index = {name: k for k, name in enumerate(_PARAMETER_NAMES[: len(covariance)])}
     index.update({one.model.name: one.index for one in solution.extras})
     notes = describe_degeneracies(covariance[np.ix_([*index.values()], [*index.values()])], [*index])
-    notes += describe_misfit(weighted, solution.system.residual)
+    notes += describe_misfit(weighted, residual, excess)
     if solution.added_covariance is not None:
         covariance[1:6, 1:6] += solution.added_covariance
     model_sigma = systematic_error(context.model)
@@ -430,7 +435,6 @@ def _build_estimate(
     warnings = check_convergence(context, weighted, solution, sigma[1:6])
     registration = Registration.from_array(solution.alpha)
     if not warnings:
-        residual = solution.system.residual
         notes += () if clocking is None else clocking.describe(sigma[1:6])
         notes += tuple(describe_description(weighted, residual, registration, solution.state))
     numbering = numbering_covariance(context.model)
@@ -441,13 +445,13 @@ def _build_estimate(
         Estimate(solution.width, float(sigma[WIDTH]) if sigma.size > WIDTH else 0.0),
         len(warnings) == 0,
         tuple(context.history),
-        weighted.reduced_chi_squared(solution.system.residual),
+        weighted.reduced_chi_squared(residual),
         warnings,
         (*describe_numbering(context.model, registration), *notes),
         extras={one.model.name: one.to_estimate(sigma, model_sigma) for one in solution.extras},
         **_fitted_mirror(context, solution, covariance),
         repeatability_covariance=between_runs * np.outer(share, share) + numbering,
-        goodness_of_fit=assess_fit(weighted, solution.system.residual),
+        goodness_of_fit=assess_fit(weighted, residual, excess),
     )
 
 
@@ -497,4 +501,9 @@ def check_convergence(
     worst = int(np.argmax(sigma / MAX_STEP))
     if sigma[worst] > MAX_STEP[worst]:
         warnings.append(f"the data do not constrain {PARAMETERS[worst]}; use more frames or more modes")
+    is_doubtful = bool(warnings or solution.excess_scatters)
+    if is_doubtful and solution.gain > 0 and not any(ORIENTATION_HINT in warning for warning in warnings):
+        hint = find_better_orientation(context.matrix, context.model, context.columns, solution.alpha)
+        if hint is not None:
+            warnings.insert(0, f"the model does not explain the matrix as described; {hint}")
     return tuple(warnings)

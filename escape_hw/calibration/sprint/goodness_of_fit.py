@@ -8,6 +8,7 @@ of a model that does not fit gives a registration whose errors contain the misfi
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,6 +23,7 @@ from escape_hw.calibration.sprint.coarse_search import MIN_EXPLAINED_FRACTION
 from escape_hw.calibration.sprint.diagnostics import check_orientation, suggest_orientation
 from escape_hw.calibration.sprint.tip_tilt import remove_tip_tilt
 from escape_hw.calibration.sprint.weighted_matrix import WeightedMatrix
+from escape_hw.pipeline.statistics import NORMAL_RATIO
 
 #: Largest rms of the residual beyond the noise, relative to that of the matrix. A tenth is what the best
 #: known description of a real mirror leaves; beyond it scalings and rotation are those of a wrong model.
@@ -34,8 +36,6 @@ _TOLERATED_MISFIT = 0.02
 _TOLERATED_EXCESS = 0.21
 #: Standard errors that the mean square of the residual must be beyond the noise to count as a misfit.
 _SIGNIFICANT = 3.0
-#: Ratio of the standard deviation of a normal variable to its median absolute deviation.
-_NORMAL_RATIO = 1.4826
 #: Norm of the fitted matrix in standard errors below which the sensor does not see the mirror: the largest of
 #: some hundred starts of a search in pure noise reaches about 5.
 _MIN_SIGNIFICANCE = 10.0
@@ -45,6 +45,16 @@ _MAX_PATTERN, _MIN_MODES = 0.5, 5
 _MAX_SCALING, _MAX_ROTATION = 20.0, 30.0
 #: Sub-apertures or actuators with an outlying residual that are named at most.
 _MAX_NAMED = 12
+
+#: Groups of random effects, as :class:`~.normal_equations.Priors` names them, in messages.
+_EFFECTS = {
+    "shape_scale": "the coefficients of the shape of the influence functions",
+    "sampling": "the sampling positions of the lenslets",
+    "actuator_gain": "the gains of the actuators",
+    "actuator_width": "the widths of the influence functions",
+    "actuator_position": "the positions of the actuators",
+    "slope_gain": "the gains of the slopes",
+}
 
 #: Note of a fit that is not judged.
 NOT_JUDGED = "the matrix has no standard errors, so whether the model fits to within its noise is not judged"
@@ -104,43 +114,59 @@ def _error_of_mean(square: NDArray[np.float64]) -> float:
     by_mode, by_sub_aperture = square.mean(axis=0), square.mean(axis=1).reshape(2, -1).mean(axis=0)
     variance = 0.0
     for part in (by_mode, by_sub_aperture):
-        deviation = _NORMAL_RATIO * float(np.median(np.abs(part - np.median(part))))
+        deviation = NORMAL_RATIO * float(np.median(np.abs(part - np.median(part))))
         variance += deviation**2 / part.size
     return float(np.sqrt(max(variance, 2.0 / square.size)))
 
 
-def assess_fit(weighted: WeightedMatrix, residual: NDArray[np.float64]) -> GoodnessOfFit | None:
-    """Whether the model fits, and what it leaves where; ``None`` without standard errors.
+def assess_fit(
+    weighted: WeightedMatrix, residual: NDArray[np.float64], excess_scatters: Mapping[str, float]
+) -> GoodnessOfFit | None:
+    """Whether the model fits, and what it leaves where; ``None`` where neither noise nor priors tell.
 
     Parameters
     ----------
     weighted, residual
         As for :meth:`Misfit.of`. Without standard errors the residual may be noise.
+    excess_scatters
+        Groups of random effects that scatter by more than their priors can, and by how many times.
     """
-    if not weighted.has_standard_errors:
+    if not weighted.has_standard_errors and not excess_scatters:
         return None
     misfit = Misfit.of(weighted, residual)
-    return GoodnessOfFit(not misfit.matters, misfit.fraction, *_rms_by_part(weighted, residual))
+    fits = not misfit.matters and not excess_scatters
+    return GoodnessOfFit(fits, misfit.fraction, *_rms_by_part(weighted, residual))
 
 
-def describe_misfit(weighted: WeightedMatrix, residual: NDArray[np.float64]) -> tuple[str, ...]:
-    """A note that the model does not fit, or that this cannot be judged; empty if it fits.
+def describe_misfit(
+    weighted: WeightedMatrix, residual: NDArray[np.float64], excess_scatters: Mapping[str, float]
+) -> tuple[str, ...]:
+    """Notes that the model does not fit, or that this cannot be judged; empty if it fits.
 
-    Parameters
-    ----------
-    weighted, residual
-        As for :func:`assess_fit`.
+    Parameters as for :func:`assess_fit`.
     """
+    chi2 = weighted.reduced_chi_squared(residual)
+    by_residual = np.sqrt(chi2) / weighted.noise_level(residual)
+    factor = max(float(by_residual), *excess_scatters.values(), 1.0)
+    contain = f"the standard errors of the registration contain a factor of {factor:.1f} for it"
+    notes: tuple[str, ...] = ()
+    if excess_scatters:
+        parts = [f"{_EFFECTS[name]} ({ratio:.1f} times)" for name, ratio in excess_scatters.items()]
+        notes = (
+            f"the model does not fit: {' and '.join(parts)} scatter by more than those of one device differ; "
+            "are the influence functions (devices.dm.influence, coupling) and the layout as described? "
+            f"{contain[0].upper()}{contain[1:]}",
+        )
     if not weighted.has_standard_errors:
-        return (NOT_JUDGED,)
+        return (*notes, NOT_JUDGED)
     misfit = Misfit.of(weighted, residual)
     if not misfit.matters:
-        return ()
-    chi2 = weighted.reduced_chi_squared(residual)
+        return notes
     return (
+        *notes,
         f"the model does not fit: {misfit.fraction:.0%} of the matrix remain beyond its noise (reduced "
-        f"chi-squared {chi2:.3g}, {misfit.excess / misfit.excess_sigma:.0f} standard errors above 1); the "
-        f"standard errors of the registration contain a factor of {np.sqrt(chi2):.1f} for it",
+        f"chi-squared {chi2:.3g}, {misfit.excess / misfit.excess_sigma:.0f} standard errors above 1); "
+        f"{contain}",
     )
 
 

@@ -26,7 +26,7 @@ from escape_hw.calibration.sprint.influence_shape import (
 )
 from escape_hw.calibration.sprint.normal_equations import NormalEquations, Priors, normal_equations
 from escape_hw.calibration.sprint.weighted_matrix import WeightedMatrix
-from escape_hw.pipeline.statistics import root_mean_square
+from escape_hw.pipeline.statistics import NORMAL_RATIO, root_mean_square
 
 #: Indices of the common parameters among the unknowns; those of the registration are 1 to 5.
 GAIN, WIDTH, SHAPE = 0, 6, 7
@@ -426,6 +426,23 @@ class MixedEffectsProblem:
         inflation = system.estimate_noise_inflation() if self.trends.shape[1] else 1.0
         priors = replace(self.priors, **scatter, noise_inflation=inflation)
         return PriorEstimate(priors, float(np.sum(1 - variance * self.precision)))
+
+    def excess_scatters(self, state: MixedEffectsState, system: NormalEquations) -> dict[str, float]:
+        """Groups of random effects that scatter by more than their priors can, and by how many times.
+
+        The scatter is that of the bulk, from the median: single actuators or sub-apertures may fail.
+        """
+        offset, usual = self.offset(state), self._usual_priors
+        relative = {
+            name: offset[members] / getattr(usual, name)
+            for name, members in self._effect_groups(system).items()
+        } | {"slope_gain": state.slope_gain / usual.slope_gain}
+        relative["shape_scale"] /= self.shape.prior_sigma
+        ratios = {
+            name: NORMAL_RATIO * float(np.median(np.abs(values))) / _MAX_PRIOR_RATIO
+            for name, values in relative.items()
+        }
+        return {name: ratio for name, ratio in ratios.items() if ratio > 1}
 
     def _effect_groups(self, system: NormalEquations) -> dict[str, NDArray[np.intp]]:
         """Unknowns of each group of random effects, by the name of its scatter in :class:`Priors`."""

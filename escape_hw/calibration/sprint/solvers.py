@@ -6,7 +6,7 @@ fit is here, its problem in :mod:`~.mixed_effects`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import TypeVar
 
@@ -128,6 +128,8 @@ class SprintSolution:
         The full step of the registration at the end ``(5,)``.
     state
         Values of all parameters and random effects; ``None`` for solvers without random effects.
+    excess_scatters
+        Groups of random effects that scatter by more than their priors can, and by how many times.
     """
 
     system: LinearisedProblem
@@ -142,6 +144,7 @@ class SprintSolution:
     actuator_corrections: Callable[[], ActuatorCorrections] | None = None
     remaining_step: NDArray[np.float64] | None = None
     state: MixedEffectsState | None = None
+    excess_scatters: Mapping[str, float] = field(default_factory=dict)
 
 
 def solve(
@@ -270,6 +273,7 @@ def _fit_mixed_effects(
         actuator_corrections=lambda: problem.actuator_corrections(state, system),
         extras=problem.extra_parameter_values(state),
         remaining_step=remaining_step, state=state,
+        excess_scatters=problem.excess_scatters(state, system),
     )  # fmt: skip
 
 

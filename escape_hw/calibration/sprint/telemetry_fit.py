@@ -43,6 +43,8 @@ _OPEN_LOOP_ROUNDS = 4
 _CLOSED_LOOP_ROUNDS = 6
 #: Smallest number of whitened frames for an estimate of the noise.
 MIN_WHITENED_FRAMES = 12
+#: Singular values of the pokes, relative to the largest, below which a pattern was not poked.
+_MIN_SINGULAR_RATIO = 1e-6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -164,7 +166,7 @@ def fit_telemetry(
     priors, n_effective_parameters, state = options["usual_priors"], 0.0, None
     rounds = _CLOSED_LOOP_ROUNDS if data.closed else _OPEN_LOOP_ROUNDS
     for number in range(rounds):
-        frames = _WhitenedFrames.from_telemetry(data, filters, lags)
+        frames = WhitenedFrames.from_telemetry(data, filters, lags)
         n = len(frames.slopes)
         if n < MIN_WHITENED_FRAMES:
             raise TooFewFrames(
@@ -179,6 +181,10 @@ def fit_telemetry(
             residual = slopes - frames.delayed_commands(response.weights) @ matrix.T
         degrees_of_freedom = max(n - 1 - n_effective_parameters / slopes.shape[1], 1.0)
         variance = np.square(residual).sum(axis=0) / degrees_of_freedom
+        pure = None if matrix is None else frames.pure_error(response.weights)
+        if pure is not None:
+            # Misfit of the model included, it would be taken for noise; of single slopes it is better known.
+            variance *= float(pure.sum() / variance.sum())
         covariance = residual.T @ residual / n if residual.shape[1] <= MAX_CORRELATED_SLOPES else None
         iteration_options = options.copy()
         if number < rounds - 1:  # Corrections of single actuators are needed from the last iteration only.
@@ -195,13 +201,27 @@ def fit_telemetry(
             priors, n_effective_parameters = prior_estimate.priors, prior_estimate.n_effective_parameters
         if order:
             filters = fit_history_filters(*_residual_slopes(data, matrix, response), order)
-    # The noise is that of the residual of the previous iteration, misfit included.
-    estimate = replace(fit.estimate, goodness_of_fit=None)
+    estimate = fit.estimate
+    if pure is None and estimate.model_fits:
+        # The noise is that of the residual of the previous iteration, in which a misfit may be.
+        notes = *estimate.notes, _describe_unjudged(data.closed, n, template.n_modes)
+        estimate = replace(estimate, goodness_of_fit=None, notes=notes)
     return TelemetryFit(estimate, response, filters[-1], covariance, n)
 
 
+def _describe_unjudged(closed: bool, n_frames: int, n_modes: int) -> str:
+    """Note on a fit that is not judged, because its own residual is all that is known of the noise."""
+    unjudged = "whether the model fits to within the noise is not judged"
+    if closed:
+        return f"{unjudged}: the commands of a closed loop follow the noise"
+    return (
+        f"{unjudged}: {n_frames} frames after whitening are too few for {n_modes} modes, "
+        f"{n_modes + 1 + MIN_WHITENED_FRAMES} are enough"
+    )
+
+
 @dataclass(frozen=True, slots=True, eq=False)
-class _WhitenedFrames:
+class WhitenedFrames:
     """Whitened slopes ``(n, n_slopes)``, commands and pokes by lag ``(lags, n, n_modes)``, without means.
 
     In open loop the commands are the pokes.
@@ -214,7 +234,8 @@ class _WhitenedFrames:
     @classmethod
     def from_telemetry(
         cls, data: AlignedTelemetry, filters: list[NDArray[np.float64]], lags: int
-    ) -> _WhitenedFrames:
+    ) -> WhitenedFrames:
+        """Whiten telemetry by filters of rising order, and delay commands and pokes by each lag."""
         past = count_known_history(data.present, len(filters) - 1)
         # The mean slopes are unknown: project out a constant, filtered as the slopes are.
         constant = apply_history_filters(np.ones((past.size, 1)), filters, past)
@@ -233,6 +254,23 @@ class _WhitenedFrames:
     def delayed_commands(self, response: NDArray[np.float64]) -> NDArray[np.float64]:
         """Commands convolved with the response ``(n, n_modes)``."""
         return np.asarray(np.tensordot(response, self.commands, axes=1))
+
+    def pure_error(self, response: NDArray[np.float64]) -> NDArray[np.float64] | None:
+        """Variance of each slope about a least-squares matrix ``(n_slopes,)``, which no model fits worse.
+
+        ``None`` in closed loop, where the commands follow the slopes, and with fewer than
+        :data:`MIN_WHITENED_FRAMES` frames more than such a matrix has unknowns per slope.
+        """
+        if self.commands is not self.pokes:
+            return None
+        patterns, values, _ = np.linalg.svd(self.delayed_commands(response), full_matrices=False)
+        patterns = patterns[:, values > _MIN_SINGULAR_RATIO * values[0]]
+        # One more for the mean.
+        degrees_of_freedom = len(self.slopes) - 1 - patterns.shape[1]
+        if degrees_of_freedom < MIN_WHITENED_FRAMES:
+            return None
+        residual = self.slopes - patterns @ (patterns.T @ self.slopes)
+        return np.asarray(np.square(residual).sum(axis=0) / degrees_of_freedom)
 
     def columns(
         self,
@@ -271,7 +309,7 @@ def _residual_slopes(
     return (residual - residual[data.present].mean(axis=0)).astype(np.float32), data.present
 
 
-def _initial_response(frames: _WhitenedFrames) -> TemporalResponse:
+def _initial_response(frames: WhitenedFrames) -> TemporalResponse:
     """A response of one lag, that of the largest correlation of slopes and pokes."""
     power = [float(np.square(frames.slopes.T @ pokes).sum()) for pokes in frames.pokes]
     weights = np.zeros(len(power))
@@ -280,7 +318,7 @@ def _initial_response(frames: _WhitenedFrames) -> TemporalResponse:
 
 
 def _estimate_response(
-    frames: _WhitenedFrames, matrix: NDArray[np.float64], known: TemporalResponse | None
+    frames: WhitenedFrames, matrix: NDArray[np.float64], known: TemporalResponse | None
 ) -> TemporalResponse:
     """Weights of the lags, scaled to sum 1, with errors from the scatter over frames.
 
