@@ -1,7 +1,7 @@
 """Effect of every constant that enters a prior or a stated error of SPRINT, halved and doubled.
 
-    python benchmarks/studies/registration/constants.py --system razor-shwfs --frames 1000 --first 1000 --out docs/studies/constants
-    python benchmarks/studies/registration/constants.py --system razor-pywfs --frames 1500 --first 1000 --out docs/studies/constants
+    python benchmarks/studies/registration/constants.py --system razor-shwfs --frames 1000 --first 10000 --out docs/studies/constants
+    python benchmarks/studies/registration/constants.py --system razor-pywfs --frames 1500 --first 10000 --out docs/studies/constants
 
 Each realisation, as in ``registration_errors.py``, is measured once with DO-CRIME. Its matrix is then fitted
 with the constants as they are, and again with one of them halved or doubled. Writes
