@@ -14,10 +14,11 @@ from escape_hw.api.registration import PARAMETERS, UNITS
 from escape_hw.api.results import CalibrationResult, Estimate, RegistrationEstimate
 from escape_hw.config.layouts import shorten
 from escape_hw.errors import IncompatibleProduct
-from escape_hw.pipeline.statistics import NORMAL_RATIO
 from escape_hw.report.figures.matrix import representative_modes
 from escape_hw.report.tables import TITLES, Table, format_error, format_with_error
 
+#: Standard deviation of normal values relative to their median absolute deviation.
+_NORMAL_MAD = 1.4826
 #: Change of an actuator's gain, in standard deviations of the changes of all, from which on it is not chance;
 #: and relative, from which on it is named.
 _OUTLYING, _NAMED_CHANGE = 6.0, 0.05
@@ -137,7 +138,7 @@ def changed_gains(first: NDArray[np.float64], second: NDArray[np.float64]) -> di
     """
     ratio = (1 + second) / (1 + first)
     change = ratio / np.median(ratio) - 1
-    scatter = NORMAL_RATIO * float(np.median(np.abs(change)))
+    scatter = _NORMAL_MAD * float(np.median(np.abs(change)))
     outlying = np.flatnonzero(np.abs(change) > _OUTLYING * scatter)
     return {int(k): float(change[k]) for k in outlying[np.argsort(-np.abs(change[outlying]))]}
 
