@@ -67,6 +67,9 @@ class Overshooting:
     def extra_parameter_values(self, state):
         return ()
 
+    def excess_scatters(self, state, system):
+        return {}
+
 
 def descend(problem, most=40, learning_rate=1.0):
     context = SolverContext(None, None, np.arange(3), "mixed-effects", learning_rate, most, Priors())
