@@ -87,7 +87,7 @@ def test_a_matrix_without_standard_errors_is_not_judged() -> None:
 def test_effects_that_scatter_by_more_than_their_priors_can_are_a_misfit(has_standard_errors: bool) -> None:
     weighted = replace(weighted_matrix(100.0), has_standard_errors=has_standard_errors)
     residual = np.random.default_rng(1).standard_normal(weighted.data.shape)
-    excess = {"actuator_gain": 2.8, "sampling": 1.3}
+    excess = {"actuator_gain": 2.8, "actuator_width": 1.3}
     found = assess_fit(weighted, residual, excess)
     assert found is not None
     assert found.fits is False

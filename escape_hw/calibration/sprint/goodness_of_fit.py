@@ -46,14 +46,12 @@ _MAX_SCALING, _MAX_ROTATION = 20.0, 30.0
 #: Sub-apertures or actuators with an outlying residual that are named at most.
 _MAX_NAMED = 12
 
-#: Groups of random effects, as :class:`~.normal_equations.Priors` names them, in messages.
+#: Groups of effects of the mirror, as :class:`~.normal_equations.Priors` names them, in messages.
 _EFFECTS = {
     "shape_scale": "the coefficients of the shape of the influence functions",
-    "sampling": "the sampling positions of the lenslets",
     "actuator_gain": "the gains of the actuators",
     "actuator_width": "the widths of the influence functions",
     "actuator_position": "the positions of the actuators",
-    "slope_gain": "the gains of the slopes",
 }
 
 #: Note of a fit that is not judged.
@@ -129,7 +127,7 @@ def assess_fit(
     weighted, residual
         As for :meth:`Misfit.of`. Without standard errors the residual may be noise.
     excess_scatters
-        Groups of random effects that scatter by more than their priors can, and by how many times.
+        Groups of effects of the mirror that scatter by more than their priors can, and by how many times.
     """
     if not weighted.has_standard_errors and not excess_scatters:
         return None

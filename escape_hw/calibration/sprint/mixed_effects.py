@@ -428,15 +428,16 @@ class MixedEffectsProblem:
         return PriorEstimate(priors, float(np.sum(1 - variance * self.precision)))
 
     def excess_scatters(self, state: MixedEffectsState, system: NormalEquations) -> dict[str, float]:
-        """Groups of random effects that scatter by more than their priors can, and by how many times.
+        """Groups of effects of the mirror that scatter by more than their priors can, and by how many times.
 
-        The scatter is that of the bulk, from the median: single actuators or sub-apertures may fail.
+        The scatter is that of the bulk, from the median: single actuators may fail. Those of the sensor are
+        not judged: lenslets of real benches scatter by more, and the registration hardly depends on it.
         """
         offset, usual = self.offset(state), self._usual_priors
+        groups = self._effect_groups(system)
         relative = {
-            name: offset[members] / getattr(usual, name)
-            for name, members in self._effect_groups(system).items()
-        } | {"slope_gain": state.slope_gain / usual.slope_gain}
+            name: offset[groups[name]] / getattr(usual, name) for name in ("shape_scale", *_ACTUATOR_PRIORS)
+        }
         relative["shape_scale"] /= self.shape.prior_sigma
         ratios = {
             name: NORMAL_RATIO * float(np.median(np.abs(values))) / _MAX_PRIOR_RATIO

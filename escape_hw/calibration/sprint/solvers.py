@@ -129,7 +129,7 @@ class SprintSolution:
     state
         Values of all parameters and random effects; ``None`` for solvers without random effects.
     excess_scatters
-        Groups of random effects that scatter by more than their priors can, and by how many times.
+        Groups of effects of the mirror that scatter by more than their priors can, and by how many times.
     """
 
     system: LinearisedProblem
