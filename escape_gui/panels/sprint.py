@@ -120,7 +120,7 @@ class SprintPanel(Panel):
             self.tabs.setCurrentIndex(1)
 
     def redraw(self) -> None:
-        if "registration" in self._data:
+        if self._data.get("registration", np.empty(0)).size:  # a fit begins without an iteration
             self._show_history()
         if "registration_track" in self._data:
             marks = [

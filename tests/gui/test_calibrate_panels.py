@@ -591,6 +591,18 @@ def test_a_converged_fit_with_a_noisy_mode_or_a_misfit_is_not_green(calibrate, s
     assert f"Usable: {words}" in calibrate.notifications.notifications[-1].text
 
 
+def test_a_fit_without_an_iteration_yet_is_waited_for(calibrate, source):
+    """As the first progress of a short run, whose frames are fitted."""
+    source.push("registration", np.zeros((0, 5), np.float32))
+    source.push("step_norm", np.zeros(0, np.float32))
+    refresh(calibrate)
+    assert calibrate.update_timer.failed_panels == {}
+    push_convergence(source)
+    refresh(calibrate)
+    assert calibrate.update_timer.failed_panels == {}
+    assert "18 iterations" in calibrate.panels["sprint"]._indicator.text
+
+
 def test_many_notes_leave_room_for_the_convergence(calibrate, source):
     push_convergence(source)
     notes = [NOT_JUDGED, *(f"note {k} that is long enough to need two lines of the panel" for k in range(12))]
