@@ -21,15 +21,30 @@ def served(system: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[S
 
 
 @pytest.fixture(scope="module")
-def bench(served: Served) -> Iterator[Connection]:
+def connected(served: Served) -> Iterator[Connection]:
     with served.connect(control=True) as one:
         until_idle(one)
         yield one
 
 
+@pytest.fixture
+def bench(connected: Connection) -> Iterator[Connection]:
+    """The bench at rest before and after: a test that fails leaves nothing to the next one."""
+    usual = {name: connected.check_camera(name).current for name in ("wfs", "science")}
+    yield connected
+    if connected.state.loop.closed:
+        connected.open_loop()
+    connected.abort()
+    until_idle(connected)
+    connected.set_offsets({}, flat="clear", references="clear")
+    for name, settings in usual.items():
+        if connected.check_camera(name).current != settings:
+            connected.set_camera(name, exposure_s=settings.exposure_s, region=settings.region)
+
+
 @pytest.fixture(scope="module")
-def matrix(bench: Connection) -> str:
-    run = bench.start("docrime", frames=1000)
+def matrix(connected: Connection) -> str:
+    run = connected.start("docrime", frames=1000)
     run.wait(120)
     return f"docrime-{run.id}"
 
@@ -92,9 +107,6 @@ def test_in_closed_loop_only_the_exposure_of_the_science_camera_changes(
     frames = bench.state.rates.frames
     wait_for(lambda: bench.state.rates.frames > frames + 100, "the loop goes on")
     assert bench.state.loop.closed
-    bench.open_loop()
-    until_idle(bench)
-    bench.set_camera("science", exposure_s=science.exposure_s)
 
 
 def test_a_poke_is_checked_held_and_returns_to_flat_by_itself(bench: Connection) -> None:
