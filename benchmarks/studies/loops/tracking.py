@@ -3,7 +3,7 @@
     python benchmarks/studies/loops/tracking.py track --seconds 600 --out tracked
     python benchmarks/studies/loops/tracking.py compare --loop true --out tracked
     python benchmarks/studies/loops/tracking.py compare --loop first --out tracked
-    python benchmarks/studies/loops/tracking.py draw --out tracked --figure docs/figures/tracking.png
+    python benchmarks/studies/loops/tracking.py draw --out tracked --figure tracking.png
 
 ``track`` calibrates, finds the optical gains on a pyramid, and runs the tracker once over all frames. It
 writes its table with the twin's true values (``track.json``; ``live.jsonl`` while it runs). ``compare``

@@ -28,7 +28,7 @@ from escape_hw.errors import CalibrationError
 #: Standard deviations by which the pokes must explain more of the slopes than chance.
 _MIN_SIGNIFICANCE = 5.0
 #: Factor on the chance level for noise that is not white: one filter for all slopes leaves some correlation
-#: in each slope, and without a response the estimated one is broad. Up to 1.3 on the twins.
+#: in each slope, and without a response the estimated one is broad.
 _COLOURED_NOISE_FACTOR = 1.5
 #: Least reciprocal condition number of the information on the modes.
 _MIN_RECIPROCAL_CONDITION = 1e-7

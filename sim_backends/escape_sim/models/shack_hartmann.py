@@ -145,8 +145,7 @@ def gaussian_lattice() -> NDArray[np.float64]:
     """Nodes ``(n, 2)`` of equal weight for the mean over a round Gaussian of unit rms.
 
     The effect of pixels and threshold on a slope is periodic in pixels, and a regular grid of few nodes
-    aliases it: five Gauss-Hermite nodes per axis left a pattern of 4 % in the response and errors of
-    the sampling positions up to 2.5 % of a sub-aperture. In a Fibonacci lattice (Sloan & Joe 1994),
+    aliases it (docs/decisions/0019-fit-to-telemetry.md). In a Fibonacci lattice (Sloan & Joe 1994),
     mapped to the Gaussian along each axis, no two nodes share a coordinate. It is symmetric about 0.
     """
     i = np.arange(_N_NODES)
@@ -451,9 +450,10 @@ def _apply_to_factors(table, first_y, first_x, side, y, out):  # type: ignore[no
 
 #: Up to this many modes, forming their surfaces is faster than the slopes of all actuators.
 _MAX_DIRECT_MODES = 12
-#: Actuator pitch in lenslets up to which the shapes of pokes within lenslets count: with 2.4 they do not.
+#: Actuator pitch in lenslets up to which the shapes of pokes within lenslets count
+#: (docs/studies/lenslet-pokes.md).
 _MAX_PITCH = 1.5
-#: Random pokes for each node of the spot motion: their sample moves the shift by 0.02 % of a sub-aperture.
+#: Random pokes for each node of the spot motion: a smaller sample would move the shift.
 _N_POKES = 8
 #: Changes of the registration, in its units, within which the pokes need not be computed again.
 _SAME_POKES_WITHIN = np.array([0.5, 0.5, 0.05, 0.1, 0.1])
