@@ -41,16 +41,23 @@ SENSOR_KEYS = {
 }
 _SHAPE = "escape_hw.calibration.sprint.influence_shape"
 _EFFECTS = "escape_hw.calibration.sprint.mixed_effects"
+_ERRORS, _WEIGHTS = "escape_hw.calibration.sprint.covariance", "escape_hw.calibration.sprint.weighted_matrix"
 _LENSLETS, _PYRAMID = "escape_sim.models.shack_hartmann", "escape_sim.models.pyramid"
+_TURBULENCE = "escape_sim.models.pyramid_turbulence"
 #: Constants by kind of sensor: module and name.
 CONSTANTS = {
     "any": (
         (_SHAPE, "_PROFILE_SIGMA"), (_SHAPE, "_FOURFOLD_SIGMA"), (_SHAPE, "_EDGE_GAIN_SIGMA"),
         (_SHAPE, "_EDGE_WIDTH_SIGMA"), (_SHAPE, "_EDGE_PROFILE_SIGMA"), (_SHAPE, "_EDGE_ASYMMETRY_SIGMA"),
-        (_EFFECTS, "_PSEUDO_COUNT"), (_EFFECTS, "_MIN_PRIOR_RATIO"),
+        (_EFFECTS, "_PSEUDO_COUNT"), (_EFFECTS, "_MIN_PRIOR_RATIO"), (_EFFECTS, "_MAX_PRIOR_RATIO"),
+        (_EFFECTS, "_MEAN_STIFFNESS"), (_WEIGHTS, "_HUBER_THRESHOLD"), (_ERRORS, "_MIN_LEVEL"),
+        (_ERRORS, "_N_GROUPS"), (_ERRORS, "_N_RINGS"), (_ERRORS, "_WINDOW"),
     ),
     "shack-hartmann": ((_LENSLETS, "_TILT_VARIANCE"), (_LENSLETS, "_OUTER_SCALE")),
-    "pyramid": ((_PYRAMID, "_OUTER_SCALE"),),
+    "pyramid": (
+        (_PYRAMID, "_OUTER_SCALE"), (_PYRAMID, "_MIN_SLOPE_WEIGHT"), (_PYRAMID, "_MIN_RELATIVE_FLUX"),
+        (_TURBULENCE, "_MIN_SHARE"),
+    ),
 }  # fmt: skip
 
 
@@ -59,7 +66,7 @@ def scaled(module: str, name: str, factor: float) -> Iterator[None]:
     """A constant of a module, multiplied by a factor for the time being."""
     owner = importlib.import_module(module)
     value = getattr(owner, name)
-    setattr(owner, name, value * factor)
+    setattr(owner, name, type(value)(value * factor))
     try:
         yield
     finally:

@@ -70,6 +70,8 @@ class LowRankNoise:
 
 #: Groups of actuators, and rings of sub-apertures, that are left out in turn.
 _N_GROUPS, _N_RINGS = 20, 4
+#: Distance at which scores count as independent, in larger sides of the grid of sub-apertures.
+_WINDOW = 0.5
 #: Slopes whose projections on all actuators are in memory at once.
 _SLOPES_AT_ONCE = 256
 
@@ -97,8 +99,8 @@ class LinearisedProblem(Protocol):
 
 
 def _bartlett_windows(valid: NDArray[np.bool_]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Bartlett windows of the distances of rows and columns: 1, falling to 0 at half the larger side."""
-    half_width = max(valid.shape) / 2
+    """Bartlett windows of the distances of rows and columns: 1, falling to 0 at :data:`_WINDOW`."""
+    half_width = _WINDOW * max(valid.shape)
     rows, columns = (np.arange(n, dtype=float) for n in valid.shape)
     row_window, column_window = (
         np.maximum(1 - np.abs(at[:, None] - at) / half_width, 0.0) for at in (rows, columns)
