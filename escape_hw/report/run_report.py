@@ -62,6 +62,7 @@ def render_page(run: RunContent) -> str:
             document.get("finished_utc") and f"{str(document['finished_utc'])[:19].replace('T', ' ')} UTC",
             f"seed {document['seed']}" if document.get("seed") is not None else None,
             document.get("software") and f"ESCAPE {document['software']}",
+            document.get("git") and f"commit {document['git']}",
         )
         if part
     )
@@ -98,12 +99,15 @@ def _key_numbers(run: RunContent) -> dict[str, str]:
     # A matrix and what was computed from it share their frames: one number for both.
     shared: dict[str, list[str]] = {}
     for label, result in run.calibrations.items():
-        if not result.frames:
+        # Optical gains scale a matrix whose frames are those of an earlier run.
+        if not result.frames or run.document["command"] == "gains":
             continue
-        text = f"{result.frames:,} ({result.sky_seconds:.3g} s)".replace(",", "\u2009")
+        text = f"{result.frames:,} ({result.sky_seconds:.3g} s)"
         shared.setdefault(text, []).append(label)
     for text, labels in shared.items():
         found[f"{' and '.join(labels)}: frames"] = text
+    for label, gains in run.gains.items():
+        found[f"optical gains of {label}: frames"] = f"{gains.frames:,}"
     found |= _track_key_numbers(run.document)
     if run.document.get("wall_seconds") is not None:
         found["wall clock"] = f"{float(run.document['wall_seconds']):.0f} s"
@@ -117,7 +121,7 @@ def _track_key_numbers(document: dict[str, Any]) -> dict[str, str]:
     """What a tracked run comes to."""
     if not document.get("track"):
         return {}
-    frames = f"{document['frames']:,} ({document['seconds']:.3g} s)".replace(",", "\u2009")
+    frames = f"{document['frames']:,} ({document['seconds']:.3g} s)"
     n_accepted = sum(one["accepted"] for one in document["exchanges"])
     found = {
         "closed loop: frames": frames,
@@ -133,9 +137,11 @@ def _registration_section(run: RunContent) -> str:
     estimates = run.estimates()
     if not estimates:
         return ""
-    caption = "Registration of the mirror seen by the sensor, with standard errors."
+    caption = "α: registration of the mirror seen by the sensor, with standard errors."
+    if any(estimate.repeatability_sigma is not None for estimate in estimates.values()):
+        caption += " ± between runs: the part of the error that differs between runs of one set-up."
     if run.injected is not None:
-        caption += " Δ: difference from the injected value; no estimator reads it."
+        caption += " Δ / σ: difference from the injected value, which no estimator reads, in standard errors."
     parts = [html.table(tables.registration_table(estimates, run.injected), caption)]
     for number, (label, estimate) in enumerate(estimates.items()):
         what = f" ({label})" if label else ""
@@ -144,8 +150,8 @@ def _registration_section(run: RunContent) -> str:
                 html.figure(
                     f"sprint{number}",
                     figures_registration.convergence(estimate, run.injected),
-                    f"SPRINT convergence{what}: step norm (top) and the parameters per iteration. "
-                    "Band: final value with its standard error."
+                    f"SPRINT convergence{what}: step norm (top; a gap where the model changed) and the "
+                    "parameters per iteration. Band: final value with its standard error."
                     + (" Dotted: injected value." if run.injected is not None else ""),
                 )
             )
@@ -183,16 +189,19 @@ def _gains_section(run: RunContent) -> str:
     parts = []
     for number, (label, result) in enumerate(run.gains.items()):
         if result.rounds:
+            relative = "its matrix" if result.comparisons else f"the {label} matrix"
             caption = (
-                f"Optical gain of every mode relative to the {label} matrix, with standard errors, and the "
-                "trend with its own."
+                f"Optical gain of every mode relative to {relative}, with standard errors, and the trend "
+                "with its own."
             )
             parts.append(html.figure(f"og{number}", figures_gains.optical_gains(result), caption))
         caption = (
-            "First closure: effective gain and residual at each gain tried. Rounds: change of the gains."
+            "Top: effective gain of the loop and residual wavefront at each gain tried on the way to the "
+            "target. Bottom: change of the optical gains in each round."
         )
         parts.append(html.figure(f"bootstrap{number}", figures_gains.bootstrap(result), caption))
-        parts.append(html.table(tables.rounds_table(result), "Rounds of the bootstrap."))
+        caption = "Rounds of the measurement. Strehl lost: due to the pokes, relative."
+        parts.append(html.table(tables.rounds_table(result), caption))
         parts.append(html.note_list(list(result.notes)))
     return html.section("Optical gains", *parts) if parts else ""
 
@@ -220,7 +229,7 @@ def _loops_section(run: RunContent) -> str:
             )
         )
     if scans := run.document.get("scans"):
-        caption = "Search for each matrix's own best gain."
+        caption = "Search for each matrix's own best gain; without the gains at which the loop was unstable."
         parts.append(html.figure("gains", figures_bench.gain_scan(scans), caption))
     return html.section("Closed loop", *parts)
 
@@ -275,8 +284,8 @@ def _matrices_section(run: RunContent) -> str:
             html.figure(
                 "errors",
                 figures_matrix.errors_per_mode(matrices),
-                "Signal-to-noise ratio and standard error per mode. The errors of a computed matrix are "
-                "those of its registration and its gain, which all slopes share.",
+                "Signal-to-noise ratio (dotted: 1) and standard error per mode. The errors of a computed "
+                "matrix are those of its registration and its gain, which all slopes share.",
             )
         )
     calibration_notes = [
@@ -318,12 +327,14 @@ def _bench_section(run: RunContent) -> str:
     for calibration in run.calibrations.values():
         if calibration.mean_frame is not None:
             drawing = figures_bench.sensor_frame(calibration.mean_frame, calibration.grid, "mean frame")
-            parts.append(html.figure("mean", drawing, "Mean sensor frame and what was found on it."))
+            caption = "Mean sensor frame, square root of the counts; outlines: sub-apertures or pupil images."
+            parts.append(html.figure("mean", drawing, caption))
             break
     label, loop = next(reversed(run.loops.items()), ("", None))
     if loop is not None and loop.last_frame is not None:
         drawing = figures_bench.sensor_frame(loop.last_frame, None, "one frame")
-        parts.append(html.figure("frame", drawing, f"The last sensor frame of the {label} loop."))
+        caption = f"The last sensor frame of the {label} loop, square root of the counts."
+        parts.append(html.figure("frame", drawing, caption))
     shape = None if loop is None else _mirror_figure(run, loop.last_command)
     if shape is not None:
         parts.append(html.figure("mirror", shape, f"The last mirror command of the {label} loop."))

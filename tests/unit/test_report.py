@@ -18,6 +18,7 @@ from escape_hw.api.results import Estimate
 from escape_hw.config import layouts
 from escape_hw.errors import IncompatibleProduct, ProductError
 from escape_hw.io import documents
+from escape_hw.io.fits.gains import save_gains
 from escape_hw.io.fits.loop import save_loop
 from escape_hw.io.fits.matrix import save_matrix
 from escape_hw.io.run_folder import RunFolder
@@ -237,6 +238,36 @@ def test_convergence_draws_parameters_truth_and_errors():
         )
         assert truth.get_ydata()[0] == getattr(fake.INJECTED, name)
         assert "[" in panel.get_ylabel()
+
+
+def test_a_change_of_the_model_is_a_gap_in_the_step_norm():
+    estimate = fake.registration()
+    steps = [
+        *estimate.iterations[:2],
+        replace(estimate.iterations[1], step_norm=0.0),
+        *estimate.iterations[2:],
+    ]
+    changed = replace(estimate, iterations=tuple(steps))
+    (drawn,) = figures_registration.convergence(changed).axes[0].lines
+    assert np.isnan(drawn.get_ydata()[2])
+    assert len(drawn.get_ydata()) == len(steps)
+
+
+def test_a_report_of_optical_gains_states_its_own_frames(tmp_path):
+    result = fake.gains_result()
+    rescaled = fake.calibration(n=8, n_modes=6)
+    with RunFolder("razor-shwfs", "gains", tmp_path / "run") as run:
+        run.add_product("gains", save_gains(run.file("gains.fits"), result, "razor-shwfs", True))
+        run.add_product("im", save_matrix(run.file("im.fits"), rescaled))
+        run.write_result(
+            {
+                **documents.header_fields("gains", "razor-shwfs", True, 1),
+                **documents.gains_document(result),
+            }
+        )
+    page = write_report(run.path).read_text(encoding="utf-8")
+    assert page.count(": frames</dt>") == 1
+    assert f"<dd>{result.frames:,}</dd>" in page
 
 
 def test_loops_without_images_or_strehl_draw():

@@ -257,16 +257,20 @@ def residual_strip(loops: Mapping[str, LoopResult]) -> Figure:
         axes.plot(
             seconds, loop.residual_nm, color=colour, lw=0.8, alpha=0.85, label=_residual_label(label, loop)
         )
-    style.style_axes(axes).set(xlabel="bench time [s]", ylabel="residual wavefront [nm rms]")
-    # The wavefront before closing is ten times larger; a linear scale would show nothing else.
-    axes.set_yscale("log")
-    axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-    axes.yaxis.set_major_formatter(ScalarFormatter())
-    axes.yaxis.set_minor_formatter(NullFormatter())
+    style.style_axes(axes).set(xlabel="time in closed loop [s]", ylabel="residual wavefront [nm rms]")
+    _logarithmic_residual(axes)
     axes.margins(x=0.01)
     if shown:
         style.legend(axes, ncols=3, loc="lower left", bbox_to_anchor=(0, 1.0), borderaxespad=0.2)
     return figure
+
+
+def _logarithmic_residual(axes: Axes) -> None:
+    """Logarithmic scale: the residual before closing or near instability is ten times larger."""
+    axes.set_yscale("log")
+    axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axes.yaxis.set_major_formatter(ScalarFormatter())
+    axes.yaxis.set_minor_formatter(NullFormatter())
 
 
 def _residual_label(label: str, loop: LoopResult) -> str:
@@ -308,6 +312,7 @@ def gain_scan(scans: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure:
             values = 100 * np.array([[peak["value"], peak["sigma"] or 0.0] for _, peak in rated])
             right.errorbar([g for g, _ in rated], values[:, 0], values[:, 1], fmt="o-", capsize=2, **line)
     style.style_axes(left).set(xlabel="loop gain", ylabel="residual wavefront [nm rms]")
+    _logarithmic_residual(left)
     style.style_axes(right).set(xlabel="loop gain", ylabel="Strehl ratio, peak [%]")
     if scans:
         style.legend(left, ncols=3, loc="lower left", bbox_to_anchor=(0, 1.0), borderaxespad=0.2)

@@ -60,9 +60,9 @@ def bootstrap(result: GainsResult) -> Figure:
     number = np.arange(1, len(steps) + 1)
     effective = [step.gain * step.optical_gain for step in steps]
     top.plot(number, effective, "o-", ms=3, color=style.SERIES[0], label="effective gain")
-    top.axhline(result.loop_gain, color=style.MUTED, lw=1.0, ls=":", label="wanted")
+    top.axhline(result.loop_gain, color=style.MUTED, lw=1.0, ls=":", label="target")
     top.xaxis.set_major_locator(MaxNLocator(integer=True))
-    style.style_axes(top).set(xlabel="gain tried in the first closure", ylabel="effective gain")
+    style.style_axes(top).set(xlabel="number of the gain tried", ylabel="effective gain")
     residual = top.twinx()
     line = residual.plot(
         number, [step.residual_nm for step in steps], "s--", ms=3, lw=1.0, color=style.SERIES[1],

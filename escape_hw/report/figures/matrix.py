@@ -54,8 +54,9 @@ def draw_mode_maps(figure: FigureBase, matrices: Mapping[str, InteractionMatrix]
             if mode < matrix.n_modes:
                 cell.imshow(_mode_colours(matrix, int(mode)), interpolation="nearest")
     style.colour_bar(
-        figure, list(axes.ravel()), style.DIVERGING, (-_LIMIT, _LIMIT), "slope / rms slope of the mode"
-    )
+        figure, list(axes.ravel()), style.DIVERGING, (-_LIMIT, _LIMIT), "slope / rms slope of the mode",
+        extend="both",
+    )  # fmt: skip
 
 
 def _mode_colours(matrix: InteractionMatrix, mode: int) -> NDArray[np.float64]:

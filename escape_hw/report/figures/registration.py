@@ -28,10 +28,9 @@ def convergence(estimate: RegistrationEstimate, injected: Registration | None = 
     figure = style.new_figure(7.8, 8.2)
     panels = figure.subplots(6, 1, sharex=True, height_ratios=[1.6, 1, 1, 1, 1, 1])
     norm = np.array([step.step_norm for step in steps], float)
-    has_step = norm > 0
-    # A step of zero (the start, or a change of the model) has no place on a logarithmic scale.
-    panels[0].plot(number[has_step], norm[has_step], "o-", color=style.SERIES[0], ms=3, lw=1.3)
-    if has_step.any():
+    # A step of zero (the start, or a change of the model) has no place on a logarithmic scale: a gap.
+    panels[0].plot(number, _positive_or_nan(norm), "o-", color=style.SERIES[0], ms=3, lw=1.3)
+    if (norm > 0).any():
         panels[0].set_yscale("log")
     style.style_axes(panels[0]).set_ylabel("relative\nstep norm")
     panels[0].set_title(
@@ -60,13 +59,14 @@ def influence_profile(profile: InfluenceProfile) -> Figure:
     """Nominal and fitted profile of the influence functions, the fitted ones with standard errors."""
     figure = style.new_figure(7.8, 3.4)
     panels = figure.subplots(1, 2)
-    curves = [(profile.fitted, profile.sigma, "fitted", style.SERIES[0])]
+    curves = [(profile.fitted, profile.sigma, "fitted", style.SERIES[0], "-")]
     if profile.edge.size:
-        curves.append((profile.edge, profile.edge_sigma, "fitted, edge actuators", style.SERIES[1]))
+        # Dashed: the profile of all actuators below it may be the same.
+        curves.append((profile.edge, profile.edge_sigma, "fitted, edge actuators", style.SERIES[1], "-."))
     panels[0].plot(profile.radius, profile.nominal, "--", color=style.INK, lw=1.1, label="nominal")
-    for values, sigma, label, colour in curves:
-        panels[0].plot(profile.radius, values, color=colour, lw=1.4, label=label)
-        panels[1].plot(profile.radius, values - profile.nominal, color=colour, lw=1.4)
+    for values, sigma, label, colour, line in curves:
+        panels[0].plot(profile.radius, values, line, color=colour, lw=1.4, label=label)
+        panels[1].plot(profile.radius, values - profile.nominal, line, color=colour, lw=1.4)
         for panel, middle in zip(panels, (values, values - profile.nominal), strict=True):
             low, high = middle - sigma, middle + sigma
             panel.fill_between(profile.radius, low, high, color=colour, alpha=0.3, lw=0)

@@ -52,7 +52,8 @@ def residual_map(
         mirror.axhline(1.0, color=style.MUTED, lw=1.0, ls=":")
         mirror.set(xlabel="actuator", ylabel=_LABEL, ylim=(0, None))
         mirror.set_title(_title("actuators", rms), color=style.INK, fontsize=9.5)
-    style.colour_bar(figure, axes, _MAP, (0.0, limit), _LABEL)
+    extend = "max" if shown.max(initial=0.0) > limit else "neither"
+    style.colour_bar(figure, axes, _MAP, (0.0, limit), _LABEL, extend=extend)
     return figure
 
 

@@ -107,8 +107,9 @@ def colour_bar(
     limits: tuple[float, float],
     label: str,
     shrink: float = 1.0,
+    extend: str = "neither",
 ) -> None:
-    """A slim colour bar next to its axes."""
+    """A slim colour bar next to its axes; ``extend`` names the ends beyond which values are drawn, too."""
     bar = figure.colorbar(
         ScalarMappable(Normalize(*limits), colormap(name)),
         ax=list(axes),
@@ -116,6 +117,7 @@ def colour_bar(
         pad=0.015,
         aspect=35 * shrink,
         shrink=shrink,
+        extend=extend,
     )
     bar.outline.set_visible(False)
     bar.ax.tick_params(colors=INK, labelsize=8, width=0.7, length=3)
