@@ -23,7 +23,7 @@ from escape_sim.mirror.mode_surfaces import (
     surface_nodes,
 )
 from escape_sim.models.base import DesignModel
-from escape_sim.models.pyramid_mean_phase import coarse_pixels, estimate_mean_phase
+from escape_sim.models.pyramid_mean_phase import coarse_pixels, estimate_mean_phase, low_order_phases
 from escape_sim.models.pyramid_response import SlopeResponse, slope_response
 from escape_sim.models.pyramid_turbulence import (
     PokePhase,
@@ -349,8 +349,12 @@ class PyramidModel(DesignModel):
             return np.zeros(5)
         if self._turbulence_scatter is None:
             optics, x = self.optics(), self._pupil.coordinates_m
-            screens = self._phases.phases(self.turbulence)
-            pokes = self._pokes.phases(_N_SHAPES) if self._pokes else np.zeros((1, *screens.shape[1:]))
+            screens = self._phases.phases(self.turbulence)[:, None]
+            if self.mean_phase is not None:
+                # The model knows the low orders of the mean wavefront.
+                low_orders = low_order_phases(x / (self._config.system.pupil_m / 2))
+                screens = self._phases.opposite_phases(self.turbulence, low_orders)
+            pokes = self._pokes.phases(_N_SHAPES) if self._pokes else np.zeros((1, *screens.shape[2:]))
             modes = self._basis()
             shapes = modes @ np.random.default_rng(2).standard_normal((modes.shape[1], _N_SHAPES))
             stroke_m = 2 * self._config.devices.dm.stroke_m

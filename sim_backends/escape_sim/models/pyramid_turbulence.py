@@ -124,6 +124,21 @@ class Turbulence:
         change = self._uncorrected - self._corrected
         return np.asarray(strength ** (5 / 6) * (self._corrected + self.left * change))
 
+    def opposite_phases(self, strength: float, shapes: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The random phases, each with one of opposite shapes ``(count, 2, n, n)`` in radians.
+
+        The mean of a wavefront whose coefficients of some shapes ``(k, n, n)`` are known is linear in them.
+        It is reversed, and the rest is the same, so that both wavefronts are equally probable.
+        """
+        phases, lit = self.phases(strength), self._lit
+        piston = np.ones((1, np.count_nonzero(lit)))
+        coefficients = np.linalg.pinv(np.vstack([shapes[:, lit], piston]).T)[:-1]
+        covariance = -0.5 * coefficients @ self.pair_structure(strength)
+        mean = np.linalg.solve(covariance @ coefficients.T, covariance)
+        opposite = phases.copy()
+        opposite[:, lit] -= 2 * (phases[:, lit] @ coefficients.T) @ mean
+        return np.stack([phases, opposite], axis=1)
+
     def structure(self, strength: float) -> NDArray[np.float64]:
         """Structure function in rad^2 in open loop ``(2 n - 1, 2 n - 1)``, by the separation of samples."""
         return structure_function(self._distances, 1 / strength, self._outer_scale)
@@ -327,8 +342,10 @@ def turbulence_registration_scatter(
 
     The response of a pyramid depends on the wavefront: pixels saturate where it is steep. A model
     describes the mean, so its registration errs by this scatter over the root of the number of states
-    that a measurement averaged. It is computed from differences of frames with a mirror shape up and
-    down. Pokes are new in every frame and average as noise, which the fit's standard errors include.
+    that a measurement averaged. A state may consist of several wavefronts, whose mean response counts: what
+    the model is told of the wavefront is no error. The scatter is computed from differences of frames with a
+    mirror shape up and down. Pokes are new in every frame and average as noise, which the fit's standard
+    errors include.
     Shapes and pokes are the same in every state, so that their own effect is none of the scatter. Groups of
     shapes, with their pokes, are fitted by themselves; what they do not have in common in one state is not
     due to the turbulence (analysis of variance).
@@ -338,7 +355,7 @@ def turbulence_registration_scatter(
     optics
         The nominal sensor.
     screens
-        Random states of the turbulence ``(count, n, n)`` in radians.
+        Random states of the turbulence ``(count, m, n, n)`` in radians, m wavefronts each.
     pokes
         Random pokes beside each shape ``(k, n, n)`` in radians, or ``(1, n, n)`` for all of them.
     paths_m
@@ -352,13 +369,14 @@ def turbulence_registration_scatter(
     half_step_m = _STEP_WAVES * optics.wavelength_m / float(paths_m.std())
     pokes_m, screens_m = (phases * (optics.wavelength_m / (2 * np.pi)) for phases in (pokes, screens))
     around = np.broadcast_to(pokes_m, paths_m.shape)
-    for screen in screens_m:
+    for state in screens_m:
         slopes = [
-            slopes_of_image(optics.frame((screen + poke + half_step_m * path).astype(np.float32)), pupils)
-            - slopes_of_image(optics.frame((screen + poke - half_step_m * path).astype(np.float32)), pupils)
+            sign * slopes_of_image(optics.frame((screen + poke + step).astype(np.float32)), pupils)
             for poke, path in zip(around, paths_m, strict=True)
+            for screen in state
+            for sign, step in ((1, half_step_m * path), (-1, -half_step_m * path))
         ]
-        measured = np.stack(slopes, axis=1)
+        measured = np.reshape(slopes, (len(paths_m), 2 * len(state), -1)).mean(axis=1).T
         fits.append(
             [
                 fit_registration_change(terms[:, :, g::_N_GROUPS], measured[:, g::_N_GROUPS])
