@@ -305,8 +305,7 @@ def _matrix_notes(result: CalibrationResult) -> list[str]:
 
 def _notes_section(run: RunContent) -> str:
     """Notes of the run that are those of none of its results."""
-    results = (*run.calibrations.values(), *run.loops.values(), *run.gains.values())
-    stated = {note for result in results for note in result.notes}
+    stated = {note for result in run.results() for note in result.notes}
     notes = [note for note in run.document.get("notes") or [] if note not in stated]
     return html.section("Notes", html.note_list(notes)) if notes else ""
 

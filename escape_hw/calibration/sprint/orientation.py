@@ -32,8 +32,8 @@ _ITERATIONS = 10
 #: Standard errors of the fitted matrix by which another orientation must explain more than the described one:
 #: in pure noise, the largest of some hundred starts of a search reaches about 5.
 _SIGNIFICANT = 10.0
-#: Fraction of the signal that it must explain. Of ten modes or more, the right one explains 0.76 to 0.99, with
-#: other influence functions, another pitch or dead actuators than described, too; wrong ones explain up to 0.3.
+#: Fraction of the signal that it must explain. With ten modes or more the right one explains 0.76 to 0.99,
+#: also with other influence functions, another pitch or dead actuators than described; wrong ones up to 0.3.
 _MIN_EXPLAINED = 0.5
 
 
