@@ -112,12 +112,13 @@ class RunContent:
         """Registrations by the heading of their column."""
         return {self.columns[n]: r.registration for n, r in self.calibrations.items() if r.registration}
 
+    def results(self) -> list[CalibrationResult | LoopResult | GainsResult]:
+        """All results."""
+        return [*self.calibrations.values(), *self.loops.values(), *self.gains.values()]
+
     def partial(self) -> bool:
         """True when any part of the run was aborted."""
-        results: list[CalibrationResult | LoopResult | GainsResult] = [
-            *self.calibrations.values(), *self.loops.values(), *self.gains.values()
-        ]  # fmt: skip
-        return bool(self.document.get("partial")) or any(result.partial for result in results)
+        return bool(self.document.get("partial")) or any(result.partial for result in self.results())
 
 
 def read_run(folder: Path | str) -> RunContent:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from escape_hw.api.results import RegistrationEstimate
+from escape_hw.api.results import CalibrationResult, RegistrationEstimate
 from escape_hw.errors import ProductError
 from escape_hw.io.storage import write_atomic
 from escape_hw.report import html, tables
@@ -80,6 +81,7 @@ def render_page(run: RunContent) -> str:
         _track_section(run),
         _matrices_section(run),
         _sky_time_section(run),
+        _notes_section(run),
         _bench_section(run),
         _origin_section(run),
     ]
@@ -165,9 +167,19 @@ def _registration_section(run: RunContent) -> str:
                     "along the edge. Bands: standard errors. 'escape influence' writes them as a file.",
                 )
             )
-        parts.append(html.note_list(list(estimate.warnings), "bad"))
-        parts.append(html.note_list(list(estimate.notes)))
+    by_name = {label or "ESCAPE": estimate for label, estimate in estimates.items()}
+    parts.append(html.note_list(_notes_by_result({k: one.warnings for k, one in by_name.items()}), "bad"))
+    parts.append(html.note_list(_notes_by_result({k: one.notes for k, one in by_name.items()})))
     return html.section("Registration", *parts)
+
+
+def _notes_by_result(notes: Mapping[str, Iterable[str]]) -> list[str]:
+    """Each note once; where there are several results, after the labels of those that have it."""
+    labels: dict[str, list[str]] = {}
+    for label, texts in notes.items():
+        for text in dict.fromkeys(texts):
+            labels.setdefault(text, []).append(label)
+    return [f"{' and '.join(who)}: {text}" if len(notes) > 1 else text for text, who in labels.items()]
 
 
 def _residual_map(run: RunContent, number: int, label: str, estimate: RegistrationEstimate) -> str:
@@ -231,7 +243,8 @@ def _loops_section(run: RunContent) -> str:
     if scans := run.document.get("scans"):
         caption = "Search for each matrix's own best gain; without the gains at which the loop was unstable."
         parts.append(html.figure("gains", figures_bench.gain_scan(scans), caption))
-    return html.section("Closed loop", *parts)
+    notes = _notes_by_result({label: loop.notes for label, loop in run.loops.items()})
+    return html.section("Closed loop", *parts, html.note_list(notes))
 
 
 def _track_section(run: RunContent) -> str:
@@ -288,17 +301,28 @@ def _matrices_section(run: RunContent) -> str:
                 "matrix are those of its registration and its gain, which all slopes share.",
             )
         )
-    calibration_notes = [
-        f"{label}: {note}" for label, result in run.calibrations.items() for note in result.notes
-    ]
-    return html.section("Interaction matrices", *parts, html.note_list(calibration_notes))
+    notes = {label: _matrix_notes(result) for label, result in run.calibrations.items()}
+    return html.section("Interaction matrices", *parts, html.note_list(_notes_by_result(notes)))
+
+
+def _matrix_notes(result: CalibrationResult) -> list[str]:
+    """Notes of a calibration without those of its registration, which are stated with it."""
+    estimate = result.registration
+    stated = () if estimate is None else (*estimate.warnings, *estimate.notes)
+    return [note for note in result.notes if note not in stated]
+
+
+def _notes_section(run: RunContent) -> str:
+    """Notes of the run that are those of none of its results."""
+    stated = {note for result in run.results() for note in result.notes}
+    notes = [note for note in run.document.get("notes") or [] if note not in stated]
+    return html.section("Notes", html.note_list(notes)) if notes else ""
 
 
 def _sky_time_section(run: RunContent) -> str:
     curves = run.document.get("sky_time")
     if not curves:
-        notes = run.document.get("notes") or []
-        return html.section("Sky time", html.note_list(notes)) if notes else ""
+        return ""
     drawing = figures_registration.error_curves(curves)
     # Version 0.1.0 called them plants.
     number = curves.get("realisations", curves.get("plants"))

@@ -8,6 +8,8 @@ from small_bench import INJECTED, assert_flat, dead, small
 
 from escape_hw.api.registration import PARAMETERS
 from escape_hw.calibration.escape.method import escape
+from escape_hw.calibration.sprint import fit
+from escape_hw.calibration.sprint.orientation import find_better_orientation
 from escape_hw.errors import CalibrationError
 from escape_hw.runtime.session.system import open_system
 
@@ -86,6 +88,22 @@ def test_a_mirror_of_another_shape_on_the_full_bench(name):
     assert not found.model_fits
     if frames >= 100:
         assert found.outcome == "converged, but the model does not fit"
+
+
+@pytest.mark.parametrize("more", [(), ("twin.mirror.shape=thin-plate",)], ids=["healthy", "another shape"])
+def test_no_orientation_is_named_where_it_is_right(more, monkeypatch):
+    """Other orientations are tried for the final result only, here whether there is a doubt or not."""
+    searches = []
+
+    def search(*arguments):
+        searches.append(find_better_orientation(*arguments))
+        return searches[-1]
+
+    monkeypatch.setattr(fit, "check_fit", lambda *_: ["a doubt"])
+    monkeypatch.setattr(fit, "find_better_orientation", search)
+    found = measured(*more, seed=1, frames=20).registration
+    assert searches == [None]
+    assert found.warnings[0] == "a doubt"
 
 
 @pytest.mark.parametrize("flip", ["left-right", pytest.param("turn-90", marks=pytest.mark.slow)])

@@ -32,6 +32,12 @@ def clocked(data: NDArray[np.float32]) -> NDArray[np.float64]:
     return np.concatenate([np.cos(turn) * x - np.sin(turn) * y, np.sin(turn) * x + np.cos(turn) * y])
 
 
+def stretched_along_a_diagonal(data: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Slopes of an image that is 5 % larger along a diagonal than along the other."""
+    x, y = np.split(data.astype(float), 2)
+    return np.concatenate([x + 0.025 * y, y + 0.025 * x])
+
+
 def without_actuators(data: NDArray[np.float32]) -> NDArray[np.float64]:
     """Two actuators do not move."""
     data = data.astype(float)
@@ -52,6 +58,7 @@ def with_a_dark_corner(data: NDArray[np.float32]) -> NDArray[np.float64]:
     [
         (stretched, "the x slopes are"),
         (clocked, "the slopes are turned by"),
+        (stretched_along_a_diagonal, "the slopes along the diagonal x = y are 5.2 % larger"),
         (without_actuators, "actuators that hardly respond: 5, 30;"),
         (with_a_dark_corner, "4 of 112 sub-apertures hardly respond, (row, column) (0, 4)"),
     ],
@@ -62,6 +69,20 @@ def test_it_is_named(change: Change, remark: str) -> None:
     assert any(remark in note for note in (*estimate.notes, *estimate.warnings)), estimate.notes
     # The error of the rotation includes what clocking does to it.
     assert abs(estimate.registration.rotation - TRUTH.rotation) < 3 * estimate.sigma[2]
+
+
+@pytest.mark.parametrize("shear", [2.5, -2.5])
+def test_a_mirror_seen_obliquely_is_no_clocked_camera(shear: float) -> None:
+    true = MODEL.zonal_matrix(TRUTH.with_shear(shear))
+    data = true + NOISE * np.random.default_rng(0).normal(size=true.shape)
+    matrix = replace(measured(0), data=data.astype(np.float32))
+    (note,) = (note for note in sprint(matrix, MODEL).notes if "the slopes" in note)
+    # A mirror that is larger along a diagonal has smaller slopes along it.
+    assert f"{'smaller' if shear > 0 else 'larger'} than along the other one" in note
+    assert "calibration.extra_parameters = ['anamorphosis']" in note
+    fitted = sprint(matrix, MODEL, extra_parameters=("anamorphosis",))
+    assert not any("the slopes" in note for note in fitted.notes)
+    assert fitted.extras["anamorphosis"].value == pytest.approx(shear, abs=0.15)
 
 
 def test_a_correct_description_has_no_remark() -> None:
@@ -150,7 +171,7 @@ def test_slopes_of_the_other_sign_are_named(signs: tuple[int, int], named: str) 
 def test_no_clocking_is_named_where_the_fit_did_not_converge() -> None:
     matrix = measured(0)
     estimate = sprint(replace(matrix, data=-clocked(matrix.data).astype(np.float32)), MODEL)
-    assert "the gain is negative" in estimate.warnings[0]
+    assert "if the polarity were reversed" in estimate.warnings[0]
     assert not any("clocked" in note for note in estimate.notes)
 
 

@@ -88,6 +88,13 @@ def test_suggestions_add_to_what_is_described_already() -> None:
 
 
 @pytest.mark.slow
+def test_a_numbering_from_the_other_end_and_the_other_sign_are_named_together() -> None:
+    found = fitted("twin.mirror.order=turn-180", "twin.mirror.polarity=-1")
+    assert not found.converged
+    assert "devices.dm.order = 'turn-180', and devices.dm.polarity = -1" in found.warnings[0]
+
+
+@pytest.mark.slow
 def test_a_table_is_not_replaced_by_a_flip() -> None:
     straight = ",".join(map(str, range(37)))
     found = fitted("twin.wfs.flip=up-down", f"devices.dm.order='numbers:{straight}'")

@@ -115,6 +115,39 @@ def test_page_says_that_the_model_does_not_fit(tmp_path):
     assert "Residual of the fit: rms over all modes" in text
 
 
+def test_every_note_is_stated_once_where_it_belongs(tmp_path):
+    """Notes of a calibration are those of its measurement and those of its registration."""
+    of_matrix, of_loop, of_run = "7 frames lost: 0.07 %", "the loop diverged", "no curve of error"
+    result = fake.calibration(n=8, n_modes=6, fits=False)
+    found = replace(result.registration, warnings=("the steps did not shrink",))
+    of_registration = (*found.warnings, *found.notes)
+    result = replace(result, registration=found, notes=(of_matrix, *of_registration))
+    loop = replace(fake.loop(), notes=(of_loop,))
+    with RunFolder("razor-shwfs", "test", tmp_path / "run") as run:
+        run.add_product("escape", save_matrix(run.file("escape.fits"), result))
+        run.add_product("loop", save_loop(run.file("loop.fits"), loop, "razor-shwfs", True))
+        run.write_result({
+            **documents.header_fields("test", "razor-shwfs", True, 1),
+            "notes": [*result.notes, of_loop, of_run],
+        })  # fmt: skip
+    sections = write_report(run.path).read_text(encoding="utf-8").split("<h2>")
+    for title, notes in {
+        "Registration": of_registration,
+        "Interaction matrices": (of_matrix,),
+        "Closed loop": (of_loop,),
+        "Notes": (of_run,),
+    }.items():
+        for note in notes:
+            (section,) = (one for one in sections if note in one)
+            assert section.startswith(title)
+            assert section.count(note) == 1
+
+
+def test_a_note_of_two_calibrations_is_stated_once(page):
+    assert page.count("<li>push-pull and ESCAPE: 7 frames lost: 0.07 %</li>") == 1
+    assert page.count("7 frames lost") == 1
+
+
 @pytest.mark.parametrize("layout", [fake.layout(), None, np.ones((2, 2), dtype=bool)])
 def test_residual_map_marks_the_outliers(layout):
     lenslets = fake.grid(8)

@@ -162,6 +162,9 @@ def descriptions(case: Case) -> dict[str, tuple[InteractionMatrix, Sequence[str]
         ),
         "half of the pupil dark": (half_outside(case), (), same),
         "camera stretched by 5 % along x": (with_slopes(case, lambda x, y: (1.05 * x, y)), (), same),
+        "image stretched by 5 % along a diagonal": (
+            with_slopes(case, lambda x, y: (x + 0.025 * y, y + 0.025 * x)), (), same,
+        ),
     }  # fmt: skip
 
 

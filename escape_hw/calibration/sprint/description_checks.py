@@ -100,11 +100,15 @@ class Clocking:
         Angle by which all slopes are turned, from +x towards +y, and its standard error.
     bias
         What it does to the registration that is fitted without it ``(5,)``.
+    diagonal_stretch
+        By how much the slopes along the diagonal x = y are larger than along the other one, relative to the
+        model, where this is significant and explains the residual better than the angle does; 0 elsewhere.
     """
 
     angle_deg: float
     sigma_deg: float
     bias: NDArray[np.float64]
+    diagonal_stretch: float = 0.0
 
     @property
     def covariance(self) -> NDArray[np.float64]:
@@ -122,6 +126,8 @@ class Clocking:
 
         ``sigma (5,)`` are the standard errors of the registration, the clocking's part included.
         """
+        if self.diagonal_stretch:
+            return (_describe_diagonal_stretch(self.diagonal_stretch),)
         angle = f"{self.angle_deg:.2f} ± {self.sigma_deg:.2f} degrees against the grid of sub-apertures"
         if abs(self.angle_deg) >= max(_SIGNIFICANT * self.sigma_deg, _MIN_ANGLE_DEG):
             return (
@@ -138,39 +144,78 @@ class Clocking:
         )
 
 
-def estimate_clocking(weighted: WeightedMatrix, system: NormalEquations) -> Clocking:
-    """Estimate the angle from the residual of a fit without it, all other unknowns adjusted.
+def _describe_diagonal_stretch(stretch: float) -> str:
+    return (
+        f"the slopes along the diagonal x = y are {abs(100 * stretch):.1f} % "
+        f"{'larger' if stretch > 0 else 'smaller'} than along the other one, relative to the model; is the "
+        "image stretched along a diagonal, or the mirror seen obliquely (calibration.extra_parameters = "
+        "['anamorphosis'])?"
+    )
 
-    One Gauss-Newton step of the fit extended by the angle. Its standard error is the larger one of those
-    from the noise and from the scatter of the scores over columns and sub-apertures, which contains the
-    misfit of the model (clusters two ways; Cameron, Gelbach & Miller 2011).
+
+def estimate_clocking(weighted: WeightedMatrix, system: NormalEquations) -> Clocking:
+    """Estimate the angle from the residual of a fit without it.
+
+    A stretch along the diagonals is estimated likewise, and named instead if it explains more: with that
+    misfit, an angle of a few hundredths of a degree may seem significant.
     """
-    x, y = np.split(system.model, 2)
-    by_slope = weighted.by_slope[:, None]
-    half = len(x)
-    turned = np.concatenate([-y * by_slope[half:] / by_slope[:half], x * by_slope[:half] / by_slope[half:]])
-    commands = turned @ system.modes.T
+    x, y = np.split(system.model * weighted.by_slope[:, None], 2)
+    turned, sheared = (weighted.weigh(np.concatenate(halves)) for halves in ((-y, x), (y, x)))
+    angle, sigma, explained, bias = _estimate_change(weighted, system, turned)
+    shear, shear_sigma, explained_by_shear, _ = _estimate_change(weighted, system, sheared)
+    is_stretched = explained_by_shear > explained and abs(2 * shear) > max(
+        _NAMED_STRETCH, _SIGNIFICANT * 2 * shear_sigma
+    )
+    return Clocking(
+        float(np.rad2deg(angle)), float(np.rad2deg(sigma)), bias, 2 * shear if is_stretched else 0.0
+    )
+
+
+def _estimate_change(
+    weighted: WeightedMatrix, system: NormalEquations, change: NDArray[np.float64]
+) -> tuple[float, float, float, NDArray[np.float64]]:
+    """One Gauss-Newton step of the fit extended by a change of the matrix, all other unknowns adjusted.
+
+    Parameters
+    ----------
+    weighted, system
+        The matrix, and the fit without the change.
+    change
+        ``(n_slopes, n_modes)`` per unit of the estimate, in standard errors.
+
+    Returns
+    -------
+    value, sigma : float
+        Amount of the change. Its standard error is the larger one of those from the noise and from the
+        scatter of the scores over columns and sub-apertures, which contains the misfit of the model
+        (clusters two ways; Cameron, Gelbach & Miller 2011).
+    explained : float
+        Sum of squares of the residual that it explains.
+    bias : ndarray, ``(5,)``
+        What it does to the registration that is fitted without it.
+    """
+    commands = change @ system.modes.T
     member = (system.lines[:, None] == np.arange(system.lines.max() + 1)).astype(float)
-    of_gains = (system.model * turned).sum(axis=1)
+    of_gains = (system.model * change).sum(axis=1)
     products = [
-        system.common.reshape(system.n_common, -1) @ turned.ravel(),
-        (turned * system.sampling_derivative).sum(axis=1) @ member,
+        system.common.reshape(system.n_common, -1) @ change.ravel(),
+        (change * system.sampling_derivative).sum(axis=1) @ member,
         of_gains @ system.trends,
         *(np.einsum("sa,sa->a", z, commands) for z in system.actuator_derivatives),
     ]
     coupled = np.concatenate(products) - system.coupling.T @ (of_gains / system.diagonal)
     inner = np.linalg.solve(system.schur_complement, coupled)
     information = float(
-        np.square(turned).sum() - np.square(of_gains) @ (1 / system.diagonal) - coupled @ inner
+        np.square(change).sum() - np.square(of_gains) @ (1 / system.diagonal) - coupled @ inner
     )
-    angle = float((turned * system.residual).sum()) / information
-    projected = turned - _modelled(system, inner, of_gains)
-    score = projected * (system.residual - angle * projected)
+    value = float((change * system.residual).sum()) / information
+    projected = change - _modelled(system, inner, of_gains)
+    score = projected * (system.residual - value * projected)
     by_column, by_sub_aperture = score.sum(axis=0), score.sum(axis=1).reshape(2, -1).sum(axis=0)
     scatter = np.square(by_column).sum() + np.square(by_sub_aperture).sum() - np.square(score).sum()
     noise = weighted.noise_level(system.residual) ** 2 * information
     sigma = float(np.sqrt(max(scatter, noise))) / information
-    return Clocking(float(np.rad2deg(angle)), float(np.rad2deg(sigma)), np.asarray(inner[1:6] * angle))
+    return value, sigma, value**2 * information, np.asarray(inner[1:6] * value)
 
 
 def _modelled(

@@ -22,11 +22,7 @@ from escape_hw.api.synthetic_model import SyntheticModel
 from escape_hw.calibration.modes.derivatives import modal_matrix
 from escape_hw.calibration.sprint.covariance import sandwich_covariance, systematic_error
 from escape_hw.calibration.sprint.description_checks import describe_description, estimate_clocking
-from escape_hw.calibration.sprint.diagnostics import (
-    ORIENTATION_HINT,
-    describe_degeneracies,
-    find_better_orientation,
-)
+from escape_hw.calibration.sprint.diagnostics import describe_degeneracies
 from escape_hw.calibration.sprint.extra_parameters import build_extra_parameters
 from escape_hw.calibration.sprint.goodness_of_fit import assess_fit, check_fit, describe_misfit
 from escape_hw.calibration.sprint.influence_estimate import estimate_profile
@@ -34,6 +30,7 @@ from escape_hw.calibration.sprint.mixed_effects import GAIN, SHAPE, WIDTH, Mixed
 from escape_hw.calibration.sprint.mode_choice import choose_modes
 from escape_hw.calibration.sprint.normal_equations import NormalEquations, Priors
 from escape_hw.calibration.sprint.numbering import describe_numbering, numbering_covariance
+from escape_hw.calibration.sprint.orientation import find_better_orientation
 from escape_hw.calibration.sprint.repeatability import repeatability_covariance
 from escape_hw.calibration.sprint.solvers import MAX_STEP, SolverContext, SprintSolution, solve
 from escape_hw.calibration.sprint.tip_tilt import TipTiltFreeModel, is_tip_tilt_removed
@@ -248,10 +245,13 @@ def fit_registration(
     extra_parameters: Sequence[ExtraParameter] = (),
     actuator_model: ActuatorModel = "fitted",
     state: MixedEffectsState | None = None,
+    check_orientation: bool = True,
 ) -> Procedure[SprintFit]:
     """SPRINT as a procedure; parameters and errors as for :func:`sprint`.
 
     The mixed-effects fit starts at ``state``, that of an earlier fit with the same model and sub-apertures.
+    Without ``check_orientation`` other orientations are not tried (:mod:`~.orientation`): an iteration that
+    another one follows does not need them.
     """
     if not 0 < learning_rate <= 1:
         raise ValueError(f"learning_rate is {learning_rate}; it must lie in (0, 1]")
@@ -276,7 +276,7 @@ def fit_registration(
         weighted = apply_model_weights(WeightedMatrix.from_columns(matrix, columns), model)
     context = SolverContext(
         matrix, model, columns, solver, learning_rate, max_iterations, priors or usual_priors,
-        build_extra_parameters(model, extra_parameters), usual_priors,
+        build_extra_parameters(model, extra_parameters), usual_priors, check_orientation,
     )  # fmt: skip
     weighted, solution = yield from _in_one_thread(
         _solve_with_updates(context, weighted, initial.to_array(), coarse_search, update_priors, loss, state)
@@ -487,10 +487,8 @@ def check_convergence(
     sigma
         Standard errors of the registration ``(5,)``.
     """
-    warnings = check_fit(
-        context.matrix, context.model, context.columns, weighted, solution.system.residual, solution.gain,
-        Registration.from_array(solution.alpha),
-    )  # fmt: skip
+    registration = Registration.from_array(solution.alpha)
+    warnings = check_fit(context.model, weighted, solution.system.residual, solution.gain, registration)
     # A large misfit of the model prevents steps as small as the noise alone would allow.
     steps_converged = solution.steps_converged or (
         solution.remaining_step is not None
@@ -501,9 +499,9 @@ def check_convergence(
     worst = int(np.argmax(sigma / MAX_STEP))
     if sigma[worst] > MAX_STEP[worst]:
         warnings.append(f"the data do not constrain {PARAMETERS[worst]}; use more frames or more modes")
-    is_doubtful = bool(warnings or solution.excess_scatters)
-    if is_doubtful and solution.gain > 0 and not any(ORIENTATION_HINT in warning for warning in warnings):
-        hint = find_better_orientation(context.matrix, context.model, context.columns, solution.alpha)
-        if hint is not None:
-            warnings.insert(0, f"the model does not explain the matrix as described; {hint}")
+    if context.checks_orientation and (warnings or solution.excess_scatters):
+        better = find_better_orientation(context.matrix, context.model, context.columns, solution.alpha)
+        if better is not None:
+            # All else that was found follows from it.
+            return (better,)
     return tuple(warnings)

@@ -15,12 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from escape_hw.api.flips import Flip
-from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.registration import PARAMETERS, Registration
 from escape_hw.api.results import GoodnessOfFit, find_outliers
 from escape_hw.api.synthetic_model import SyntheticModel
 from escape_hw.calibration.sprint.coarse_search import MIN_EXPLAINED_FRACTION
-from escape_hw.calibration.sprint.diagnostics import check_orientation, suggest_orientation
+from escape_hw.calibration.sprint.orientation import suggest_orientation
 from escape_hw.calibration.sprint.tip_tilt import remove_tip_tilt
 from escape_hw.calibration.sprint.weighted_matrix import WeightedMatrix
 from escape_hw.pipeline.statistics import NORMAL_RATIO
@@ -199,9 +198,7 @@ def describe_outliers(weighted: WeightedMatrix, residual: NDArray[np.float64]) -
 
 
 def check_fit(
-    matrix: InteractionMatrix,
     model: SyntheticModel,
-    columns: NDArray[np.intp],
     weighted: WeightedMatrix,
     residual: NDArray[np.float64],
     gain: float,
@@ -211,8 +208,8 @@ def check_fit(
 
     Parameters
     ----------
-    matrix, model, columns
-        The fitted columns of the measured matrix, and the synthetic model.
+    model
+        The synthetic model.
     weighted, residual
         The matrix in units of its standard errors, and data minus model ``(n_slopes, n_modes)`` in the same
         units.
@@ -226,7 +223,7 @@ def check_fit(
     if explained < MIN_EXPLAINED_FRACTION * signal or np.vdot(fitted, weighted.data) <= 0:
         reasons.append(
             f"the model explains {max(explained, 0.0):.0%} of the matrix where noise leaves {signal:.0%} "
-            f"to explain; {_probable_cause(matrix, model, columns, weighted)}"
+            f"to explain; {_probable_cause(weighted)}"
         )
     elif significance < _MIN_SIGNIFICANCE:
         reasons.append(
@@ -248,13 +245,8 @@ def check_fit(
     return reasons + _implausible_values(registration, model)
 
 
-def _probable_cause(
-    matrix: InteractionMatrix, model: SyntheticModel, columns: NDArray[np.intp], weighted: WeightedMatrix
-) -> str:
+def _probable_cause(weighted: WeightedMatrix) -> str:
     """Why a model explains next to nothing of a matrix, for the message."""
-    hint = check_orientation(matrix, model, columns)
-    if hint is not None:
-        return hint
     pattern = strongest_pattern_fraction(weighted.data)
     if weighted.data.shape[1] >= _MIN_MODES and pattern > _MAX_PATTERN:
         return (

@@ -60,7 +60,7 @@ MATRIX_ONLY_SOLVERS: tuple[Solver, ...] = ("batches", "diagonal")
 
 @dataclass(slots=True, eq=False)
 class SolverContext:
-    """Inputs of a fit, as for :func:`~escape_hw.calibration.sprint.fit.sprint`, and its iterations."""
+    """Inputs of a fit, as for :func:`~.fit.fit_registration`, and its iterations."""
 
     matrix: InteractionMatrix
     model: SyntheticModel
@@ -71,6 +71,7 @@ class SolverContext:
     priors: Priors
     extras: tuple[ExtraParameterModel, ...] = ()
     usual_priors: Priors = field(default_factory=Priors)
+    checks_orientation: bool = True
     history: list[SprintIteration] = field(default_factory=list)
     report: Reporter = field(init=False)
     problem: MixedEffectsProblem | None = field(init=False, default=None)

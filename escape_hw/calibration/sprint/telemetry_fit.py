@@ -186,13 +186,10 @@ def fit_telemetry(
             # Misfit of the model included, it would be taken for noise; of single slopes it is better known.
             variance *= float(pure.sum() / variance.sum())
         covariance = residual.T @ residual / n if residual.shape[1] <= MAX_CORRELATED_SLOPES else None
-        iteration_options = options.copy()
-        if number < rounds - 1:  # Corrections of single actuators are needed from the last iteration only.
-            iteration_options["actuator_model"] = "nominal"
         fit = yield from fit_registration(
             frames.columns(template, response.weights, matrix, variance), model, start=start,
             covariance=covariance, priors=priors, update_priors=False, coarse_search=start is None,
-            state=state, **iteration_options,
+            state=state, check_orientation=number == rounds - 1, **options,
         )  # fmt: skip
         state, start = fit.state, fit.estimate.registration
         matrix = fit.zonal_matrix() @ template.m2c
