@@ -20,7 +20,7 @@ STATES, SHAPES, N_SLOPES = 400, 60, 30
 
 def test_wavefronts_with_opposite_low_orders_are_turbulence_too() -> None:
     """Structure function of many pairs, which pieces of a cut wavefront would not have."""
-    n = 12
+    n = 8
     x = np.linspace(-1, 1, n)
     lit = np.hypot(*np.meshgrid(x, x)) <= 1
     turbulence = Turbulence(4.0, sample_distances(n, 1 / n), lit)
@@ -29,7 +29,7 @@ def test_wavefronts_with_opposite_low_orders_are_turbulence_too() -> None:
     covariance = -0.5 * turbulence.pair_structure(3.0).astype(float)
     covariance -= covariance.min()
     root = np.linalg.cholesky(covariance + 1e-6 * np.eye(len(covariance)))
-    screens = np.zeros((20_000, n, n))
+    screens = np.zeros((10_000, n, n))
     screens[:, lit] = rng.standard_normal((len(screens), len(root))) @ root.T
     turbulence.phases = lambda strength: screens  # type: ignore[method-assign]
     pairs = turbulence.opposite_phases(3.0, shapes)[:, :, lit]
