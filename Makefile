@@ -69,7 +69,7 @@ python: # Say which Python the environment is made with
 	@test -n "$(PYTHON)" && echo "$(PYTHON)"
 
 $(BIN)/python:
-	@test -n "$(PYTHON)" || { echo "No Python 3.11 or newer with venv found; set PYTHON=..." >&2; exit 1; }
+	@test -n "$(PYTHON)" || { echo "No Python 3.11 or newer with venv found (Debian: apt install python3-venv); set PYTHON=..." >&2; exit 1; }
 	$(PYTHON) -m venv $(VENV)
 
 $(VENV)/run.stamp: pyproject.toml $(CONSTRAINTS) | $(BIN)/python

@@ -36,6 +36,12 @@ def has_postgres() -> bool:
     return bool(shutil.which("initdb") or list(Path("/usr/lib/postgresql").glob("*/bin/initdb")))
 
 
+def find_browser() -> str | None:
+    """Chromium, or Chrome, which understands the same options."""
+    names = ("chromium", "chromium-browser", "google-chrome")
+    return next(filter(None, map(shutil.which, names)), None)
+
+
 QT = (
     "libglib-2.0.so.0", "libEGL.so.1", "libGL.so.1", "libxkbcommon.so.0", "libfontconfig.so.1",
     "libdbus-1.so.3",
@@ -64,7 +70,7 @@ NEEDED: tuple[tuple[str, Callable[[], object], tuple[str, ...]], ...] = (
         lambda: shutil.which("Xvfb") and can_load(*X11),
         X11_PACKAGES,
     ),
-    ("Chromium, for reports in a browser", lambda: shutil.which("chromium"), ("chromium",)),
+    ("Chromium, for reports in a browser", find_browser, ("chromium",)),
     ("setpriv, to run commands as another user", lambda: shutil.which("setpriv"), ("util-linux",)),
 )
 #: What tests use where it is and nothing here installs, how to look for it, and why.

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import random
-import shutil
 import subprocess
 from collections.abc import Callable, Iterator
 from html.parser import HTMLParser
@@ -15,6 +14,7 @@ from typing import Any
 import fake_results as fake
 import pytest
 from campaign_table import Campaign
+from system_packages import find_browser
 
 from escape_hw.errors import EscapeError
 from escape_hw.io import documents
@@ -26,7 +26,7 @@ from escape_hw.report.run_report import write_report
 pytestmark = [pytest.mark.campaign, pytest.mark.timeout(3000)]
 
 SEED, NUMBER = 80, 40
-BROWSER = shutil.which("chromium")
+BROWSER = find_browser()
 #: Elements that no page has by itself, and texts that leave their place in it.
 PAYLOADS = (
     "<script>alert(1)</script>", "</title><script>alert(1)</script>", "</style><script>alert(1)</script>",

@@ -394,7 +394,7 @@ class BlockingCamera(Camera, Generic[C]):
         return Frame(data, self._counter.index(number), exposed_ns, arrived_ns, saturated)
 
     def _count_saturated(self, data: NDArray[np.uint16]) -> int:
-        """Number of pixels at the top of the scale."""
+        """Number of pixels at the top of the scale, or beyond it."""
         if self._saturation_mask.shape != data.shape:
             self._saturation_mask = np.empty(data.shape, np.bool_)
-        return int(np.count_nonzero(np.equal(data, self._full_scale, out=self._saturation_mask)))
+        return int(np.count_nonzero(np.greater_equal(data, self._full_scale, out=self._saturation_mask)))

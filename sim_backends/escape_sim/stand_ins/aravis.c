@@ -31,7 +31,7 @@ static struct {
     atomic_int alive, acquiring, waiting;
     struct si_connection bench;
     int linked;
-    int x, y, width, height, bytes, rate_enabled;
+    int x, y, width, height, bits, bytes, rate_enabled;
     double exposure_us, rate_hz, gain_db;
 } camera;
 static struct {
@@ -161,6 +161,7 @@ EXPORT void *arv_camera_new(const char *name, GError **error) {
     camera.width = sensor_w;
     camera.height = sensor_h;
     camera.bytes = 1;
+    camera.bits = 8;
     camera.exposure_us = 10000;
     camera.rate_hz = 30;
     camera.gain_db = camera.rate_enabled = camera.acquiring = camera.waiting = 0;
@@ -276,7 +277,8 @@ EXPORT void arv_camera_set_pixel_format_from_string(void *handle, const char *fo
     BEGIN("arv_camera_set_pixel_format_from_string", , " %s", format);
     if (strncmp(format, "Mono", 4) || strstr(profile->formats, format) == NULL)
         return set_error(error, "[PixelFormat] entry not found");
-    camera.bytes = strcmp(format, "Mono8") ? 2 : 1;
+    camera.bits = atoi(format + 4);
+    camera.bytes = camera.bits > 8 ? 2 : 1;
 }
 
 /* The caller frees the list, not the names in it. */
@@ -397,9 +399,10 @@ static int fill_buffer(Buffer *buffer, uint64_t wait_us, const struct si_rule *r
         si_report_violation("a buffer of %zu bytes cannot hold %d pixels", buffer->size, n);
         return 0;
     }
+    int full_scale = camera.bits < 12 ? (1 << camera.bits) - 1 : 4095;
     for (int i = 0; i < n; i++) {
         int value = camera.linked ? from_bench.pixels[i]
-                                  : (3 * (i % camera.width) + 7 * (i / camera.width)) & 4095;
+                                  : (3 * (i % camera.width) + 7 * (i / camera.width)) & full_scale;
         if (camera.bytes == 2) ((uint16_t *)buffer->data)[i] = (uint16_t)value;
         else buffer->data[i] = (unsigned char)value;
     }
