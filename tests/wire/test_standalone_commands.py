@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 from asm_bench import emulator, port_of
+from astropy.io import fits
 from command_line import document, escape
 from driver_bench import fresh, stand_in
 
@@ -124,6 +127,18 @@ def test_a_camera_is_read_by_its_driver(document, tmp_path) -> None:
     code, found, _ = document("camera", "stream", *words, *fast, "--seconds", 0.05)
     # A busy computer may lose frames; the exit code tells.
     assert code == (1 if found["status"]["lost"] else 0)
+
+
+def test_the_command_of_the_page_of_the_c_blue_one(document, tmp_path) -> None:
+    fresh("aravis", "set profile c-blue-one\nset serial 17123456")
+    page = (Path(__file__).parents[2] / "docs/devices/c-blue-one.md").read_text(encoding="utf-8")
+    (line,) = (line for line in page.splitlines() if line.startswith("$ escape camera snap"))
+    out = tmp_path / "a.fits"
+    words = [*line.split()[2:], "--set", f"library={stand_in('aravis').path}", "--frames", 2, "--out", out]
+    code, found, err = document(*words)
+    assert (code, found["shape"]) == (0, [1104, 1604]), err
+    assert fits.getdata(out).max() <= 1023
+    assert not stand_in("aravis").violations
 
 
 @pytest.mark.usefixtures("short_auto_zero")
