@@ -33,11 +33,11 @@ help: ## List the targets
 run: $(VENV)/run.stamp ## Calibrate the simulated RAZOR bench, close the loop, write a report
 	$(BIN)/escape reproduce shwfs $(ARGS)
 
-test: $(VENV)/test.stamp ## Run the tests
+test: $(VENV)/all.stamp ## Run the tests, with all optional packages
 	@$(BIN)/python tests/system_packages.py --window
 	$(ONE_THREAD) $(BIN)/python -m pytest $(WORKERS) $(ARGS)
 
-test-all: $(VENV)/all.stamp ## Run every test, also the slow ones, with all optional packages
+test-all: $(VENV)/all.stamp ## Run every test, also the slow ones and the campaigns
 	$(BIN)/python tests/system_packages.py --install
 	$(ONE_THREAD) $(BIN)/python -m pytest $(WORKERS) -m "not hardware and not screenshots" $(ARGS)
 
@@ -45,7 +45,7 @@ floor: ## Run the tests with the oldest versions that pyproject.toml allows
 	$(FLOOR_PYTHON) -m venv $(FLOOR)
 	$(FLOOR)/bin/python .ci/floor.py > $(FLOOR)/constraints.txt
 	$(FLOOR)/bin/python -m pip --disable-pip-version-check install --quiet \
-		--constraint $(FLOOR)/constraints.txt --editable '.[test]'
+		--constraint $(FLOOR)/constraints.txt --editable '.[all]'
 	$(ONE_THREAD) $(FLOOR)/bin/python -m pytest $(WORKERS) -W default::DeprecationWarning $(ARGS)
 
 check: $(VENV)/dev.stamp ## Check style, types and layers
