@@ -142,8 +142,12 @@ def test_an_environment_is_made_with_the_tested_versions() -> None:
     if shutil.which("make") is None:
         pytest.skip("make is not installed")
     words = ["make", "--dry-run", "--always-make", f"PYTHON={sys.executable}", "test"]
+    # The settings of a make that runs this test are not for this one.
+    own = {name: value for name, value in os.environ.items() if not name.startswith("MAKE")}
     done = [
-        subprocess.run([*words, *more], cwd=ROOT, capture_output=True, text=True, check=True, timeout=60)
+        subprocess.run(
+            [*words, *more], cwd=ROOT, env=own, capture_output=True, text=True, check=True, timeout=60
+        )
         for more in ([], ["CONSTRAINTS=constraints.txt"])
     ]
     newest, tested = (one.stdout for one in done)
