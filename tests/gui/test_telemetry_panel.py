@@ -81,8 +81,8 @@ def test_a_recording_of_some_seconds_is_requested_grows_and_is_analysed(
     window.update_timer.tick(force=True)
     assert panel.record_button.text() == "Record"
     # Files that were still being written when the recording ended are analysed again.
-    wait_for(lambda: "1,024 frames, 2.0 s" in panel.source_label.text())
-    assert "no modes without correction" in panel.source_label.text()
+    wait_for(lambda: "no modes without correction" in panel.source_label.text())
+    assert "1,024 frames, 2.0 s" in panel.source_label.text()
 
 
 def test_a_recording_of_a_hidden_panel_is_analysed_when_it_is_shown(
