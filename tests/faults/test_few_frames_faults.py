@@ -92,18 +92,18 @@ def test_a_mirror_of_another_shape_on_the_full_bench(name):
 
 @pytest.mark.parametrize("more", [(), ("twin.mirror.shape=thin-plate",)], ids=["healthy", "another shape"])
 def test_no_orientation_is_named_where_it_is_right(more, monkeypatch):
-    """Other orientations are tried for the final result only, here whether there is a doubt or not."""
+    """Other orientations are tried for the final result only; every result has a warning here."""
     searches = []
 
     def search(*arguments):
         searches.append(find_better_orientation(*arguments))
         return searches[-1]
 
-    monkeypatch.setattr(fit, "check_fit", lambda *_: ["a doubt"])
+    monkeypatch.setattr(fit, "check_fit", lambda *_: ["a warning"])
     monkeypatch.setattr(fit, "find_better_orientation", search)
     found = measured(*more, seed=1, frames=20).registration
     assert searches == [None]
-    assert found.warnings[0] == "a doubt"
+    assert found.warnings[0] == "a warning"
 
 
 @pytest.mark.parametrize("flip", ["left-right", pytest.param("turn-90", marks=pytest.mark.slow)])

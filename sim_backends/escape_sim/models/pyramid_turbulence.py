@@ -343,9 +343,9 @@ def turbulence_registration_scatter(
     The response of a pyramid depends on the wavefront: pixels saturate where it is steep. A model
     describes the mean, so its registration errs by this scatter over the root of the number of states
     that a measurement averaged. A state may consist of several wavefronts, whose mean response counts: what
-    the model is told of the wavefront is no error. The scatter is computed from differences of frames with a
-    mirror shape up and down. Pokes are new in every frame and average as noise, which the fit's standard
-    errors include.
+    the model takes into account of the wavefront is no error. The scatter is computed from differences of
+    frames with a mirror shape up and down. Pokes are new in every frame and average as noise, which the
+    fit's standard errors include.
     Shapes and pokes are the same in every state, so that their own effect is none of the scatter. Groups of
     shapes, with their pokes, are fitted by themselves; what they do not have in common in one state is not
     due to the turbulence (analysis of variance).
