@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import traceback
+from collections.abc import Mapping
 from os.path import basename
 
 
@@ -79,13 +80,23 @@ class StorageError(EscapeError):
 
 
 class Aborted(EscapeError):
-    """The operator stopped a procedure; ``partial`` is its result so far, or ``None``."""
+    """The operator stopped a procedure; ``partial`` is its result so far, or ``None``.
+
+    ``stopped_at`` has the ``stage`` that was stopped, and how much of it was ``done``, of how much in
+    ``total``, in which ``unit``; it is empty if no stage had begun.
+    """
 
     exit_code = 130
 
-    def __init__(self, message: str = "aborted by the operator", partial: object = None) -> None:
+    def __init__(
+        self,
+        message: str = "aborted by the operator",
+        partial: object = None,
+        stopped_at: Mapping[str, str | int] | None = None,
+    ) -> None:
         super().__init__(message)
         self.partial = partial
+        self.stopped_at = dict(stopped_at or {})
 
 
 class LeaseHeld(EscapeError):

@@ -348,6 +348,7 @@ HEALTH_LEVELS: dict[DeviceHealth, Level] = {
 
 QUALITY_LEVELS: dict[Quality, Level] = {
     Quality.GOOD: Level.GOOD, Quality.USABLE: Level.WARNING, Quality.NOT_USABLE: Level.ERROR,
+    Quality.ABORTED: Level.WARNING,
 }  # fmt: skip
 
 

@@ -69,6 +69,10 @@ class Progress:
             return float("nan")
         return self.elapsed_s * max(0, self.total - self.done) / self.done
 
+    def to_dict(self) -> dict[str, str | int]:
+        """Stage and steps in plain values."""
+        return {"stage": self.stage, "done": self.done, "total": self.total, "unit": self.unit}
+
 
 #: Request to stop.
 StopSignal = SignalSafeFlag | threading.Event
@@ -161,23 +165,25 @@ def _advance_until_done(
     abort: StopSignal,
     interrupted: SignalSafeFlag,
 ) -> T:
-    deadline = None
+    deadline, last = None, None
     while True:
         throw = deadline is None and (abort.is_set() or interrupted.is_set())
         try:
             if throw:
                 deadline = time.monotonic() + ABORT_GRACE_S
-                progress = procedure.throw(_aborted_error(interrupted))
+                progress = procedure.throw(_aborted_error(interrupted, last))
             else:
                 progress = next(procedure)
         except StopIteration as done:
             result: T = done.value
             if deadline is not None:
-                raise _aborted_error(interrupted, partial=result) from None
+                raise _aborted_error(interrupted, last, partial=result) from None
             return result
         if deadline is not None and time.monotonic() > deadline:
             log.error("the procedure did not end within %g s after the abort and is closed", ABORT_GRACE_S)
-            raise _aborted_error(interrupted)
+            raise _aborted_error(interrupted, last)
+        if deadline is None:
+            last = progress
         try:
             _notify_observers(observers_left, progress)
         except KeyboardInterrupt:
@@ -193,10 +199,9 @@ def _notify_observers(observers_left: list[Observer], progress: Progress) -> Non
             observers_left.remove(observer)
 
 
-def _aborted_error(interrupted: SignalSafeFlag, partial: object = None) -> Aborted:
-    if interrupted.is_set():
-        return Aborted("interrupted by Ctrl-C", partial)
-    return Aborted(partial=partial)
+def _aborted_error(interrupted: SignalSafeFlag, last: Progress | None, partial: object = None) -> Aborted:
+    message = "interrupted by Ctrl-C" if interrupted.is_set() else "aborted by the operator"
+    return Aborted(message, partial, None if last is None else last.to_dict())
 
 
 def _close(procedure: Procedure[T]) -> None:

@@ -286,7 +286,7 @@ class CommandContext:
                 with _note_without_result():
                     result, stop = self.run_keeping_partial(procedure.procedure(bench, folder))
             with self.protect_saving(stop):
-                saved = procedure.save(folder, record, result, self.wall_seconds)
+                saved = procedure.save(folder, record.with_end(stop), result, self.wall_seconds)
                 self.result(saved.document, met=saved.met)
                 self.show(*format_result(procedure.name, result, record.simulated, saved.document))
             if stop is not None:

@@ -19,6 +19,7 @@ from escape_hw.report.verdict import Quality, assess
 
 _QUALITY_STYLES = {
     Quality.GOOD: "bold green", Quality.USABLE: "bold yellow", Quality.NOT_USABLE: "bold red",
+    Quality.ABORTED: "bold yellow",
 }  # fmt: skip
 
 _CRITERION_STYLES = {"✓": "green", "!": "bold yellow", "✗": "bold red"}

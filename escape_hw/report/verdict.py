@@ -1,4 +1,4 @@
-"""One line of verdict on the result of a run: good, usable or not usable, why, and what to do."""
+"""One line of verdict on the result of a run: good, usable, not usable or aborted, why, and what to do."""
 
 from __future__ import annotations
 
@@ -18,11 +18,12 @@ UNCERTAIN_SHIFT = 100.0
 
 
 class Quality(IntEnum):
-    """Quality of a result, the worst last."""
+    """Quality of a result, the worst last; a run that was aborted has no other quality."""
 
     GOOD = 0
     USABLE = 1
     NOT_USABLE = 2
+    ABORTED = 3
 
     @property
     def text(self) -> str:
@@ -52,7 +53,21 @@ class Verdict:
 
 
 def assess(document: Mapping[str, Any]) -> Verdict | None:
-    """The verdict on a ``result.json``; ``None`` without a criterion, as for a reference PSF."""
+    """The verdict on a ``result.json``; ``None`` without a criterion, as for a reference PSF.
+
+    That on an aborted run states how far it came, and judges what was measured by then.
+    """
+    judged = _judge(document)
+    if not document.get("partial"):
+        return judged
+    reason = _describe_abort(document)
+    if judged is not None:
+        reason += f"; what was measured is {judged.quality.text}: {judged.reason}"
+    return Verdict(Quality.ABORTED, reason, "run it again")
+
+
+def _judge(document: Mapping[str, Any]) -> Verdict | None:
+    """The verdict on what a document holds."""
     figures = list(_figures(document))
     problems = list(_problems(document))
     if problems:
@@ -94,15 +109,25 @@ def _problems(document: Mapping[str, Any]) -> Iterator[Verdict]:
             yield Verdict(Quality.NOT_USABLE, f"not met: {text}", "see the report")
     yield from _uncertain_shifts(document)
     yield from _noisy_modes(document)
-    if document.get("partial"):
-        after = f" after {frames:,} frames" if _is_number(frames := document.get("frames")) else ""
-        yield Verdict(Quality.USABLE, f"the run was aborted{after}", "run it again")
     warnings = document.get("warnings")
     for warning in warnings if isinstance(warnings, list | tuple) else ():
         yield Verdict(Quality.USABLE, str(warning), "see the report")
     if alarms:
         many = f"{len(alarms)} alarms, the last" if len(alarms) > 1 else "an alarm"
         yield Verdict(Quality.USABLE, f"{many}: {alarms[-1].get('text', '')}", "see the report")
+
+
+def _describe_abort(document: Mapping[str, Any]) -> str:
+    """How far an aborted run came; files of version 0.1.0 know the frames of its result only."""
+    stop, frames = _mapping(document.get("stopped_at")), document.get("frames")
+    done, total, unit = stop.get("done"), stop.get("total"), stop.get("unit")
+    if not _is_number(done) or not _is_number(total):
+        return f"stopped after {frames:,} frames" if _is_number(frames) else "stopped before its end"
+    # Progress is reported a few times a second; a result knows its frames exactly.
+    if unit == "frame" and _is_number(frames) and done < frames <= total:
+        done = frames
+    of = f"{done:,} of {total:,}" if total else f"{done:,}"
+    return f"{stop.get('stage')} stopped after {of} {unit}s"
 
 
 def _not_judged(document: Mapping[str, Any]) -> Verdict:

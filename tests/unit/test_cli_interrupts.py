@@ -31,7 +31,11 @@ def test_ctrl_c_in_a_calibration_saves_what_there_is(document, bench, tmp_path, 
     assert bench.benches[0].closed
     assert bench.benches[0].screen.state.inserted
     assert signal.getsignal(number) is before
-    assert json.loads((tmp_path / "run" / "result.json").read_text())["partial"] is True
+    saved = json.loads((tmp_path / "run" / "result.json").read_text())
+    assert saved["partial"] is True
+    assert saved["verdict"]["quality"] == "aborted"
+    stop = saved["stopped_at"]
+    assert f"{stop['stage']} stopped after {stop['done']} of {stop['total']}" in saved["verdict"]["reason"]
 
 
 def test_ctrl_c_in_the_loop(document, bench, im, tmp_path):

@@ -63,6 +63,7 @@ def test_abort_from_another_thread_stops_at_the_next_step_and_keeps_the_partial_
     with pytest.raises(Aborted, match="by the operator") as caught:
         run(counting(10_000, log), abort=abort, observers=(operator,))
     assert caught.value.partial == 3
+    assert caught.value.stopped_at == {"stage": "count", "done": 3, "total": 10_000, "unit": "frame"}
     assert log == ["aborted", "clean"]
 
 

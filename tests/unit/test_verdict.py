@@ -7,6 +7,8 @@ import pytest
 from escape_hw.report.verdict import Quality, assess
 
 ESCAPE = {"converged": True, "iterations": 15, "frames": 600, "snr": {"min": 23.8}, "criteria": []}
+#: As a run of 600 frames reports it: the progress is a little older.
+STOPPED_AT = {"stage": "DO-CRIME", "done": 590, "total": 2000, "unit": "frame"}
 
 
 @pytest.mark.parametrize(
@@ -41,7 +43,28 @@ ESCAPE = {"converged": True, "iterations": 15, "frames": 600, "snr": {"min": 23.
         ({"converged": None, "snr": {"min": 2.0}}, Quality.USABLE, "measure about 1,400 frames"),
         ({"criteria": [{"text": "loop stable", "met": False}]}, Quality.NOT_USABLE, "not met: loop stable"),
         ({"warnings": ["scaling beyond 5 %"]}, Quality.USABLE, "scaling beyond 5 %; see the report"),
-        ({"partial": True}, Quality.USABLE, "Usable: the run was aborted after 600 frames; run it again"),
+        (
+            {"partial": True},
+            Quality.ABORTED,
+            "Aborted: stopped after 600 frames; what was measured is good: SNR 23.8 in the worst mode, "
+            "converged in 15 iterations; run it again",
+        ),
+        (
+            {"partial": True, "stopped_at": STOPPED_AT, "converged": None, "snr": {"min": 0.35}},
+            Quality.ABORTED,
+            "Aborted: DO-CRIME stopped after 600 of 2,000 frames; what was measured is not usable: SNR 0.35 "
+            "in the worst mode; run it again",
+        ),
+        (
+            {"partial": True, "stopped_at": {**STOPPED_AT, "done": 3, "total": 20, "unit": "iteration"}},
+            Quality.ABORTED,
+            "Aborted: DO-CRIME stopped after 3 of 20 iterations; what was measured is good",
+        ),
+        (
+            {"partial": True, "stopped_at": {**STOPPED_AT, "total": 0}},
+            Quality.ABORTED,
+            "DO-CRIME stopped after 590 frames",
+        ),
         ({"alarms": [{}, {"text": "jumped"}]}, Quality.USABLE, "2 alarms, the last: jumped; see the report"),
         ({"stable": False}, Quality.NOT_USABLE, "the loop was not stable; lower the gain"),
         (
@@ -79,7 +102,8 @@ def test_criteria_alone_make_a_verdict() -> None:
 @pytest.mark.parametrize(
     "document",
     [{"snr": "high"}, {"snr": {"min": "1"}}, {"criteria": [3]}, {"alarms": ["x"]}, {"warnings": 4},
-     {"strehl": {"peak": 3}, "stable": True}, {"snr": {"min": 2.0}, "frames": "many"}],
+     {"strehl": {"peak": 3}, "stable": True}, {"snr": {"min": 2.0}, "frames": "many"},
+     {"partial": True, "stopped_at": "late"}, {"partial": True, "stopped_at": {"done": "x", "total": 3}}],
 )  # fmt: skip
 def test_a_damaged_document_is_assessed_as_far_as_it_goes(document: dict[str, object]) -> None:
     verdict = assess(document)
@@ -88,3 +112,8 @@ def test_a_damaged_document_is_assessed_as_far_as_it_goes(document: dict[str, ob
 
 def test_a_result_without_a_criterion_has_no_verdict() -> None:
     assert assess({"frames": 100, "criteria": []}) is None
+
+
+def test_an_aborted_run_without_a_criterion_says_only_how_far_it_came() -> None:
+    document = {"partial": True, "stopped_at": STOPPED_AT, "criteria": []}
+    assert str(assess(document)) == "Aborted: DO-CRIME stopped after 590 of 2,000 frames; run it again"

@@ -249,7 +249,7 @@ def _run_case(
             record = replace(BenchRecord.from_bench(bench), request=request)
             result, stop = context.run_keeping_partial(case.procedure(bench, **counts))
         with context.protect_saving(stop):
-            document = case.save(folder, record, result, context.wall_seconds)
+            document = case.save(folder, record.with_end(stop), result, context.wall_seconds)
         context.result(document, met=all(entry["met"] for entry in document["criteria"]))
         if stop is not None:
             raise stop

@@ -240,7 +240,7 @@ def _run(
     if pool is not None:
         result, stop = context.run_keeping_partial(sweep_and_analyse(description, pool))
     with context.protect_saving(stop):
-        _save(context, folder, record, description, result)
+        _save(context, folder, record.with_end(stop), description, result)
     if stop is not None:
         raise stop
 

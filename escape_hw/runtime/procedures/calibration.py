@@ -218,8 +218,10 @@ class CalibrationProcedure(ProcedureSpec["CalibrationResult"]):
     def _criteria(self, result: CalibrationResult) -> list[dict[str, Any]]:
         from escape_hw.runtime.procedures import criteria
 
+        if result.partial:
+            return []
         checks, (snr, accuracy) = [], self.target
-        if result.matrix.method == "escape" and not result.partial:
+        if result.matrix.method == "escape":
             checks.append(criteria.sprint_converged("ESCAPE", result.registration))
         if accuracy is not None and result.registration is not None:
             worst = float(result.registration.sigma[:2].max())

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from typing import Any
 
 from escape_hw.api.registration import Registration
 from escape_hw.bench import Bench
 from escape_hw.config.system import SystemConfig
+from escape_hw.errors import Aborted, EscapeError
 from escape_hw.io import documents
 from escape_hw.io.provenance import Provenance, format_utc, get_git_state, get_software_version
 
@@ -21,7 +22,7 @@ class BenchRecord:
 
     ``applies_twin_section`` is true if mirror and sensor are simulated as ``[twin]`` says, unlike those of a
     foreign simulation. ``injected`` is the true registration, for reports only: no estimator reads it.
-    ``request`` holds the options of a run that can be resumed.
+    ``request`` holds the options of a run that can be resumed, ``stopped_at`` where a run was aborted.
     """
 
     system: str
@@ -37,6 +38,7 @@ class BenchRecord:
     injected: Registration | None
     started: datetime = field(default_factory=lambda: datetime.now(UTC))
     request: Mapping[str, Any] | None = None
+    stopped_at: Mapping[str, str | int] | None = None
 
     @classmethod
     def from_bench(cls, bench: Bench) -> BenchRecord:
@@ -61,6 +63,10 @@ class BenchRecord:
             injected=config.twin.registration.to_registration() if is_known else None,
         )
 
+    def with_end(self, stop: EscapeError | None) -> BenchRecord:
+        """The record at the end of a run, which ``stop`` may have aborted."""
+        return replace(self, stopped_at=stop.stopped_at) if isinstance(stop, Aborted) else self
+
     def origin(self, parents: Mapping[str, str] | None = None) -> Provenance:
         """Provenance of a product made on this bench."""
         return Provenance(self.config_text, self.basis, self.seed, self.serials, parents or {}, self.started)
@@ -73,6 +79,7 @@ class BenchRecord:
             "git": get_git_state(),
             "started_utc": format_utc(self.started),
             **({} if self.request is None else {"request": dict(self.request)}),
+            **({} if self.stopped_at is None else {"stopped_at": dict(self.stopped_at)}),
             "injected": None if self.injected is None else self.injected.to_dict(),
             "bench": {
                 "layout": list(self.layout),

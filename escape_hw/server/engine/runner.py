@@ -257,7 +257,7 @@ class ProcedureRunner:
         if psf is not None:
             self._loop_runner.model_psf = psf
             self._owner.publisher.publish_arrays({"model_psf": psf})
-        saved = task.save(folder, record, result, time.monotonic() - began)
+        saved = task.save(folder, record.with_end(stop), result, time.monotonic() - began)
         if stop is None:
             task.finish()
         return saved, stop
