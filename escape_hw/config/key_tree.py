@@ -53,6 +53,15 @@ def is_free_table(field: FieldInfo) -> bool:
     return typing.get_origin(field.annotation) is dict
 
 
+def takes_text_only(path: Sequence[str | int]) -> bool:
+    """Whether the key at a path takes text and nothing else, such as a serial number."""
+    field = locate_key(path).field
+    if field is None:
+        return False
+    options = typing.get_args(field.annotation) or (field.annotation,)
+    return {option for option in options if option is not types.NoneType} == {str}
+
+
 @dataclass(frozen=True, slots=True)
 class KeyLocation:
     """Result of following a path through the models.

@@ -143,6 +143,8 @@ def _wrong_choice(detail: ErrorDetails) -> str:
 
 #: Text accepted without quotes, which a shell removes: words, paths, network addresses.
 _BARE_WORD = re.compile(r"^(?:[A-Za-z_/~.][\w./~ :,+-]*|\d{1,3}(?:\.\d{1,3}){3})$")
+#: The same for a key whose value is text, such as a serial number, which may begin with a digit.
+_BARE_TEXT = re.compile(r"^[\w/~.][\w./~ :,+-]*$")
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,8 +156,11 @@ class Override:
     origin: str = "--set"
 
 
-def parse_override(text: str) -> Override:
+def parse_override(text: str, within: tuple[str, ...] = ()) -> Override:
     """Parse ``key=value``; the value is TOML or a bare word.
+
+    Where the key takes text only, numbers need no quotes and keep their zeros. ``within`` is the section of
+    the configuration that keys are relative to.
 
     Raises
     ------
@@ -166,16 +171,18 @@ def parse_override(text: str) -> Override:
     path = tuple(part.strip() for part in key.split("."))
     if not equals or not all(path):
         raise ConfigError(f"--set  {text!r} is not of the form section.key=value")
-    raw = raw.strip()
+    raw, is_text = raw.strip(), key_tree.takes_text_only((*within, *path))
     try:
         document = parse_toml(f"value = {raw}")
     except tomllib.TOMLDecodeError as error:
-        if not _BARE_WORD.match(raw):
+        if not (_BARE_TEXT if is_text else _BARE_WORD).match(raw):
             raise ConfigError(f"--set  {key.strip()}: {raw}  is not a TOML value: {error}") from None
         return Override(path, raw)
     if set(document) != {"value"}:
         raise ConfigError(f"--set  {key.strip()}: {raw!r}  must be one value on one line")
-    return Override(path, document["value"])
+    value = document["value"]
+    is_bare = not isinstance(value, str | bool | list | dict)
+    return Override(path, raw if is_text and is_bare else value)
 
 
 def apply_overrides(

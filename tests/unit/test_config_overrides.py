@@ -27,6 +27,25 @@ def test_value_is_toml_or_a_bare_word(text: str, value: object) -> None:
     assert type(override.value) is type(value)
 
 
+@pytest.mark.parametrize("device", ["dm", "wfs", "science", "modulator", "screen"])
+@pytest.mark.parametrize("serial", ["12345678", "0118028736", "1e5", "12-34", "17A456", "0x12", "1.50"])
+def test_a_serial_number_needs_no_quotes_and_keeps_its_zeros(device: str, serial: str) -> None:
+    assert parse_override(f"devices.{device}.serial={serial}").value == serial
+    assert parse_override(f'devices.{device}.serial="{serial}"').value == serial
+    assert parse_override(f"serial={serial}", within=("devices", device)).value == serial
+
+
+def test_a_serial_number_of_digits_reaches_the_configuration() -> None:
+    config = load_system("razor-shwfs", overrides=["devices.dm.serial=00123", "devices.wfs.serial=12345678"])
+    assert (config.devices.dm.serial, config.devices.wfs.serial) == ("00123", "12345678")
+
+
+def test_text_keys_still_refuse_what_is_no_text() -> None:
+    assert parse_override("devices.dm.serial=[1, 2]").value == [1, 2]
+    with pytest.raises(ConfigError, match=r"devices\.dm\.serial: true  must be text"):
+        load_system("razor-shwfs", overrides=["devices.dm.serial=true"])
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [

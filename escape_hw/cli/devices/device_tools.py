@@ -84,7 +84,7 @@ def select_device(
         return SelectedDevice(key, build_device(key, config, kind), config, label)
     if selection.mode is not None or selection.seed is not None:
         raise ConfigError("--mode and --seed: not with --driver, which opens one real device")
-    settings = _parse_settings(selection.set)
+    settings = _parse_settings(key, selection.set)
     if selection.serial:
         if settings.get("serial", selection.serial) != selection.serial:
             other = settings["serial"]
@@ -104,18 +104,18 @@ def check_number(option: str, value: float | None, low: float, high: float, unit
     return checked
 
 
-def _parse_settings(changes: tuple[str, ...]) -> dict[str, Any]:
-    """Settings of a driver, from ``key=value`` and ``table.key=value``."""
+def _parse_settings(key: str, changes: tuple[str, ...]) -> dict[str, Any]:
+    """Settings of a driver of ``devices.KEY``, from ``key=value`` and ``table.key=value``."""
     from escape_hw.config.loader import parse_override
 
     settings: dict[str, Any] = {}
     for text in changes:
-        override = parse_override(text)
-        *tables, key = override.path
+        override = parse_override(text, within=("devices", key))
+        *tables, last = override.path
         table = settings
         for name in tables:
             table = table.setdefault(name, {})
             if not isinstance(table, dict):
                 raise ConfigError(f"--set  {text}: {name} has a value already, {table!r}")
-        table[key] = override.value
+        table[last] = override.value
     return settings
