@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -42,6 +43,21 @@ def test_the_commands_exit_code_is_passed_on(escape, system: Path) -> None:
     assert missing.returncode == 127
     # The second reason where the path has a folder that this user may not search.
     assert re.search("error: no-such-command: (No such file or directory|Permission denied)", missing.stderr)
+
+
+@pytest.mark.slow
+def test_a_camera_that_is_used_alone_works_with_the_options_that_its_refusal_names(
+    escape, system: Path, tmp_path: Path
+) -> None:
+    snap = ("escape", "camera", "snap", "--driver", "ximea", "--frames", 1, "--out", tmp_path / "frames.fits")
+    other = escape("with-stand-ins", system, "--", *snap, "--serial", "123")
+    assert other.returncode == 3
+    assert "there are: mirror 'SIM97', wfs 'SIMWFS', science 'SIMSCI'" in other.stderr
+    whole = escape("with-stand-ins", system, "--", *snap, "--serial", "SIMWFS")
+    assert whole.returncode == 3
+    (needed,) = re.findall("used with --driver, the camera needs: (.*)", whole.stderr)
+    done = escape("with-stand-ins", system, "--", *snap, "--serial", "SIMWFS", *shlex.split(needed))
+    assert done.returncode == 0, done.stderr
 
 
 @pytest.mark.slow

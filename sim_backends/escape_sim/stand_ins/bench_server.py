@@ -13,6 +13,7 @@ from __future__ import annotations
 import contextlib
 import enum
 import logging
+import shlex
 import shutil
 import socket
 import socketserver
@@ -27,8 +28,10 @@ import numpy as np
 
 from escape_hw.api.camera import Camera, CameraSettings, Region
 from escape_hw.api.emulator import EmulatorRequest
+from escape_hw.config.devices import CameraConfig
 from escape_hw.config.registry import DeviceContext
-from escape_hw.errors import EscapeError, FrameTimeout
+from escape_hw.config.toml_text import format_value
+from escape_hw.errors import EscapeError, FrameTimeout, SettingRejected
 from escape_hw.supervision import BackgroundThread
 from escape_sim.devices.twins import make_mirror, make_science_camera, make_wfs_camera, shared_bench
 from escape_sim.emulators.e727.emulator import E727Emulator
@@ -201,16 +204,18 @@ class StandInBenchServer:
         if kind == "camera":
             # A GenICam camera, which may be either.
             kind = "wfs" if serial.upper() == devices.wfs.serial.upper() else "science"
-        section = {"mirror": devices.dm, "wfs": devices.wfs, "science": devices.science}.get(kind)
+        sections = {"mirror": devices.dm, "wfs": devices.wfs, "science": devices.science}
+        section = sections.get(kind)
         if section is None or serial.upper() != section.serial.upper():
-            log.warning("no %s with serial number %r on this bench", kind, serial)
+            known = ", ".join(f"{name} {one.serial!r}" for name, one in sections.items() if one is not None)
+            log.warning("no %s with serial number %r on this bench; there are: %s", kind, serial, known)
             return _REFUSED, b"", self._refuse_before_hello
         with self._twin_lock:
-            if kind == "mirror":
+            if not isinstance(section, CameraConfig):
                 return _OK, struct.pack("=I", devices.dm.n_act), self._open_mirror()
             make = make_wfs_camera if kind == "wfs" else make_science_camera
             camera = make(section, DeviceContext(kind, self.config, self.shared)).open()
-            return _OK, struct.pack("=I", camera.info.bit_depth), _CameraEndpoint(camera)
+            return _OK, struct.pack("=I", camera.info.bit_depth), _CameraEndpoint(camera, section)
 
     def _open_mirror(self) -> Callable[[RequestKind, bytes], Reply]:
         mirror = make_mirror(self.config.devices.dm, DeviceContext("dm", self.config, self.shared)).open()
@@ -229,8 +234,8 @@ class StandInBenchServer:
 class _CameraEndpoint:
     """Handles the requests of a camera's stand-in."""
 
-    def __init__(self, camera: Camera) -> None:
-        self._camera = camera
+    def __init__(self, camera: Camera, section: CameraConfig) -> None:
+        self._camera, self._section = camera, section
 
     def __call__(self, kind: RequestKind, payload: bytes) -> Reply:
         try:
@@ -251,13 +256,25 @@ class _CameraEndpoint:
         region = Region(*(int(number) for number in numbers[:4]))
         exposure_us, rate_hz, gain_db = numbers[4:]
         self._camera.stop()
-        self._camera.configure(CameraSettings(region, exposure_us * 1e-6, rate_hz, gain_db))
+        try:
+            self._camera.configure(CameraSettings(region, exposure_us * 1e-6, rate_hz, gain_db))
+        except SettingRejected as error:
+            # A driver that is used alone knows nothing of the system; by default it reads its whole sensor.
+            log.warning("%s; used with --driver, the camera needs: %s", error, _camera_options(self._section))
+            return _REFUSED, b""
         self._camera.start()
         return _OK, b""
 
     def _frame(self, wait_s: float) -> Reply:
         frame = self._camera.next_frame(max(wait_s, _POLL_S))
         return _OK, _FRAME_HEAD.pack(frame.index, frame.exposed_ns) + frame.data.tobytes()
+
+
+def _camera_options(section: CameraConfig) -> str:
+    """Options of a command with ``--driver`` that read the frames of a section."""
+    settings = {"region": list(section.region), **section.options}
+    changes = (f"{key}={format_value(value)}" for key, value in settings.items())
+    return shlex.join(word for change in changes for word in ("--set", change))
 
 
 def _receive(connection: socket.socket) -> tuple[RequestKind, bytes] | None:
