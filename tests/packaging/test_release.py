@@ -7,6 +7,7 @@ import contextlib
 import importlib.metadata
 import os
 import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -108,6 +109,18 @@ def test_the_desktop_entry_starts_the_window() -> None:
     assert program in PROJECT["scripts"]
     assert (command, entry["Type"], entry["Terminal"]) == ("gui", "Application", "false")
     assert (ROOT / "escape_gui" / f"{entry['Icon']}.svg").is_file()
+
+
+def test_the_entry_of_an_environment_starts_its_program_also_with_a_blank_in_its_path(tmp_path: Path) -> None:
+    folder = tmp_path / "adaptive optics"
+    (folder / ".venv/share/applications").mkdir(parents=True)
+    shutil.copy(ROOT / "desktop/escape.desktop", folder / ".venv/share/applications")
+    (command,) = re.findall(r"^\$ (sed .*) >", text("docs/tutorial/operator.md"), re.MULTILINE)
+    done = subprocess.run(
+        ["sh", "-c", command], cwd=folder, capture_output=True, text=True, check=True, timeout=60
+    )
+    (line,) = re.findall("^Exec=(.*)$", done.stdout, re.MULTILINE)
+    assert shlex.split(line) == [str(folder / ".venv/bin/escape"), "gui"]
 
 
 def test_the_hosted_run_is_the_local_one() -> None:
