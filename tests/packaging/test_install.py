@@ -45,10 +45,16 @@ def names(wheel: Path) -> set[str]:
 
 
 @pytest.fixture(scope="module")
-def unpacked(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def sdist(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The source distribution."""
+    return build("sdist", ROOT, tmp_path_factory.mktemp("source") / "sdist")
+
+
+@pytest.fixture(scope="module")
+def unpacked(sdist: Path) -> Path:
     """Folder of the unpacked source distribution."""
-    folder = tmp_path_factory.mktemp("source")
-    with tarfile.open(build("sdist", ROOT, folder / "sdist")) as archive:
+    folder = sdist.parent.parent
+    with tarfile.open(sdist) as archive:
         # Python before 3.11.4 has no filters, Python 3.12 and 3.13 warn without one.
         safely = {"filter": "data"} if hasattr(tarfile, "data_filter") else {}
         archive.extractall(folder / "unpacked", **safely)
@@ -69,17 +75,31 @@ def test_the_source_distribution_is_complete(unpacked: Path, wheel: Path, tmp_pa
     assert names(wheel) == names(build("wheel", ROOT, tmp_path / "checkout"))
 
 
+def install(python: str, source: Path, folder: Path) -> Path:
+    """Install a distribution in the tested versions into an empty environment; returns its programs."""
+    run(python, "-m", "venv", str(folder / "venv"), cwd=folder)
+    programs = folder / "venv" / "bin"
+    pip = (str(programs / "python"), "-m", "pip", "--disable-pip-version-check", "install", "--quiet")
+    run(*pip, "--constraint", str(ROOT / "constraints.txt"), str(source), cwd=folder)
+    return programs
+
+
+def test_the_source_distribution_installs_into_an_empty_environment(sdist: Path, tmp_path: Path) -> None:
+    """As pip does it: it builds the wheel itself, with the build requirements that it downloads."""
+    escape = str(install(sys.executable, sdist, tmp_path) / "escape")
+    assert run(escape, "--version", cwd=tmp_path).split() == ["escape", escape_hw.__version__]
+    poked = json.loads(
+        run(escape, "dm", "poke", "razor-shwfs", "48", "0.05", "--seconds", "0", "--json", cwd=tmp_path)
+    )
+    assert poked["peak"] == 0.05
+
+
 @pytest.mark.parametrize("minor", [11, 12, 13])
-def test_the_wheel_installs_into_an_empty_environment(
-    minor: int, unpacked: Path, wheel: Path, tmp_path: Path
-) -> None:
+def test_the_wheel_installs_into_an_empty_environment(minor: int, wheel: Path, tmp_path: Path) -> None:
     python = runpy.run_path(str(ROOT / ".ci" / "other_python.py"))["find"](minor)
     if not python:
         pytest.skip(f"no Python 3.{minor} with venv found")
-    run(python, "-m", "venv", str(tmp_path / "venv"), cwd=tmp_path)
-    programs = tmp_path / "venv" / "bin"
-    pip = (str(programs / "python"), "-m", "pip", "--disable-pip-version-check", "install", "--quiet")
-    run(*pip, "--constraint", str(unpacked / "constraints.txt"), str(wheel), cwd=tmp_path)
+    programs = install(python, wheel, tmp_path)
     escape = str(programs / "escape")
     assert run(escape, "--version", cwd=tmp_path).split() == ["escape", escape_hw.__version__]
     assert (tmp_path / "venv" / "share" / "applications" / "escape.desktop").is_file()
