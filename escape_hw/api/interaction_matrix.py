@@ -38,7 +38,8 @@ class InteractionMatrix:
     Parameters
     ----------
     data
-        ``(n_slopes, n_modes)``, slopes per unit mode (paper Eq. s = D c).
+        ``(n_slopes, n_modes)``, slopes per unit mode (paper Eq. s = D c); its rms surface is the full
+        stroke.
     sigma
         Standard error of every element, same shape, without the error of the common gain. For DO-CRIME the
         relative standard error of that gain is ``metrics["gain_sigma"]``.
@@ -94,6 +95,12 @@ class InteractionMatrix:
         """Number of modes."""
         return int(self.data.shape[1])
 
+    @property
+    def unit(self) -> str:
+        """Unit of the elements: that of the slopes per mode whose rms surface is the full stroke."""
+        slopes = "normalised slope" if self.slope_unit == "1" else self.slope_unit
+        return f"{slopes} per full stroke rms"
+
     def snr(self) -> NDArray[np.float64]:
         """Signal-to-noise ratio per mode ``(n_modes,)``: rms of the column over rms of its errors.
 
@@ -122,7 +129,7 @@ class InteractionMatrix:
         all_finite = np.isfinite(snr).all()
         return (
             f"{self.system}{' (SIMULATED)' if self.simulated else ''}",
-            f"{self.n_slopes} slopes × {self.n_modes} modes, in {self.slope_unit} per unit mode",
+            f"{self.n_slopes} slopes × {self.n_modes} modes, in {self.unit}",
             f"{snr.min():.3g} at worst, median {np.median(snr):.3g}" if all_finite else "computed",
         )
 

@@ -65,7 +65,7 @@ def test_a_matrix_states_units_errors_and_where_it_is_from() -> None:
     html = matrix()._repr_html_()
     assert "docrime" in html
     assert "a &lt;b&gt; (SIMULATED)" in html
-    assert "8 slopes × 3 modes, in pixel per unit mode" in html
+    assert "8 slopes × 3 modes, in pixel per full stroke rms" in html
     assert "77" in html
     assert pixels(html).shape[:2] == (8, 3)
 

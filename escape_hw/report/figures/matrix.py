@@ -88,8 +88,8 @@ def errors_per_mode(matrices: Mapping[str, InteractionMatrix]) -> Figure:
         below.semilogy(number, error, color=colour, lw=1.4)
     above.axhline(1.0, color=style.MUTED, lw=0.8, ls=":")
     style.style_axes(above).set_ylabel("signal-to-noise\nratio")
-    unit = next(iter(matrices.values())).slope_unit
-    style.style_axes(below).set(xlabel="mode", ylabel=f"standard error\n[{unit} / unit mode]")
+    unit = next(iter(matrices.values())).unit
+    style.style_axes(below).set(xlabel="mode", ylabel=f"standard error\n[{unit}]")
     below.set_xlim(left=0.5)
     if above.get_legend_handles_labels()[0]:
         style.legend(above, ncols=4, loc="lower left", bbox_to_anchor=(0, 1.0), borderaxespad=0.2)
