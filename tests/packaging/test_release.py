@@ -54,6 +54,11 @@ def test_every_place_has_the_same_version() -> None:
     assert newest[2] == citation.get("date-released", "unreleased")
 
 
+def test_the_package_and_its_citation_name_the_same_authors() -> None:
+    cited = re.findall(r"^  - name: (.+)$", text("CITATION.cff"), re.MULTILINE)
+    assert [one["name"] for one in PROJECT["authors"]] == cited
+
+
 def test_tested_versions_satisfy_every_requirement() -> None:
     tested = pins(text("constraints.txt"))
     for requirement in requirements("gui", "sweep", "test", "docs", "dev", *ALL):
