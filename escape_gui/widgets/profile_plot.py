@@ -33,7 +33,7 @@ class ProfilePlot(PlotGrid):
         super().build()
         plot = self.add_plot()
         style_axis(self._theme, plot.getAxis("bottom"), "Distance from the actuator [pitches]")
-        style_axis(self._theme, plot.getAxis("left"), "Surface [peak]")
+        style_axis(self._theme, plot.getAxis("left"), "Surface / peak")
         legend = plot.addLegend(offset=(-8, 8), labelTextColor=self._theme.colour("text"))
         self.bands = [ErrorBand(self._theme.series(number)) for _, _, _, number in _CURVES]
         for band, (label, *_) in zip(self.bands, _CURVES, strict=True):

@@ -88,6 +88,12 @@ class RunContent:
         return float(value) if value else None
 
     @property
+    def full_scale(self) -> int | None:
+        """Count at which a pixel of the sensor's camera saturates, where the run has stored it."""
+        value = self.document.get("bench", {}).get("full_scale")
+        return int(value) if value else None
+
+    @property
     def layout(self) -> NDArray[np.bool_] | None:
         """Map of the actuators."""
         rows = self.document.get("bench", {}).get("layout")

@@ -82,7 +82,7 @@ def render_page(run: RunContent) -> str:
         _matrices_section(run),
         _sky_time_section(run),
         _notes_section(run),
-        _bench_section(run),
+        _system_section(run),
         _origin_section(run),
     ]
     return html.page(title, banners, [part for part in parts if part])
@@ -241,7 +241,10 @@ def _loops_section(run: RunContent) -> str:
             )
         )
     if scans := run.document.get("scans"):
-        caption = "Search for each matrix's own best gain; without the gains at which the loop was unstable."
+        caption = (
+            "Search for each matrix's own best gain; without the gains at which the loop diverged, or its "
+            "residual grew to the end."
+        )
         parts.append(html.figure("gains", figures_bench.gain_scan(scans), caption))
     notes = _notes_by_result({label: loop.notes for label, loop in run.loops.items()})
     return html.section("Closed loop", *parts, html.note_list(notes))
@@ -297,8 +300,9 @@ def _matrices_section(run: RunContent) -> str:
             html.figure(
                 "errors",
                 figures_matrix.errors_per_mode(matrices),
-                "Signal-to-noise ratio (dotted: 1) and standard error per mode. The errors of a computed "
-                "matrix are those of its registration and its gain, which all slopes share.",
+                "Signal-to-noise ratio (dotted: 1) and standard error of the slopes, rms over the "
+                "sub-apertures, of modes whose rms surface is the full stroke of an actuator. The errors of "
+                "a computed matrix are those of its registration and its gain, which all slopes share.",
             )
         )
     notes = {label: _matrix_notes(result) for label, result in run.calibrations.items()}
@@ -326,7 +330,7 @@ def _sky_time_section(run: RunContent) -> str:
     drawing = figures_registration.error_curves(curves)
     # Version 0.1.0 called them plants.
     number = curves.get("realisations", curves.get("plants"))
-    realisations = f", rms over {number} random registrations" if number else ""
+    realisations = f", rms over {number} random registration{'s' * (number > 1)}" if number else ""
     caption = f"Error of the registration against the frames used{realisations}, with the Cramér-Rao bound."
     fewest_frames = curves.get("fewest_frames") or {}
     if fewest_frames:
@@ -346,18 +350,32 @@ def _mirror_figure(run: RunContent, command: NDArray[np.float64]) -> Figure | No
     return None
 
 
-def _bench_section(run: RunContent) -> str:
+def _describe_counts(frame: NDArray[np.generic], run: RunContent) -> str:
+    """The brightest pixel of a frame, and where the camera saturates."""
+    text = f"Brightest pixel: {float(frame.max()):,.0f} ADU"
+    return (
+        f"{text}." if run.full_scale is None else f"{text}; the camera saturates at {run.full_scale:,} ADU."
+    )
+
+
+def _system_section(run: RunContent) -> str:
     parts = []
     for calibration in run.calibrations.values():
         if calibration.mean_frame is not None:
             drawing = figures_bench.sensor_frame(calibration.mean_frame, calibration.grid, "mean frame")
-            caption = "Mean sensor frame, square root of the counts; outlines: sub-apertures or pupil images."
+            caption = (
+                "Mean frame of the sensor, colours by the square root of the counts. Outlines: sub-apertures "
+                f"or pupil images. {_describe_counts(calibration.mean_frame, run)}"
+            )
             parts.append(html.figure("mean", drawing, caption))
             break
     label, loop = next(reversed(run.loops.items()), ("", None))
     if loop is not None and loop.last_frame is not None:
-        drawing = figures_bench.sensor_frame(loop.last_frame, None, "one frame")
-        caption = f"The last sensor frame of the {label} loop, square root of the counts."
+        drawing = figures_bench.sensor_frame(loop.last_frame, None, "last frame")
+        caption = (
+            f"The last sensor frame of the {label} loop, colours by the square root of the counts. "
+            f"{_describe_counts(loop.last_frame, run)}"
+        )
         parts.append(html.figure("frame", drawing, caption))
     shape = None if loop is None else _mirror_figure(run, loop.last_command)
     if shape is not None:
@@ -366,7 +384,7 @@ def _bench_section(run: RunContent) -> str:
     if response is not None:
         caption = "Temporal response of mirror and sensor, from the pokes themselves, with standard errors."
         parts.append(html.figure("response", figures_bench.temporal_response(response), caption))
-    return html.section("Bench", html.figure_row(*parts))
+    return html.section("Sensor and mirror", html.figure_row(*parts))
 
 
 def _origin_section(run: RunContent) -> str:

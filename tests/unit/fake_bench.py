@@ -33,7 +33,7 @@ class FakeBench:
         self.simulated = config.system.mode == "sim"
         info = SimpleNamespace(serial="SIM97", layout=fake.layout())
         self.dm = SimpleNamespace(info=info, applies_twin_section=self.simulated)
-        camera = SimpleNamespace(serial="SIMCAM")
+        camera = SimpleNamespace(serial="SIMCAM", full_scale=1023)
         self.wfs = self.science = SimpleNamespace(info=camera, applies_twin_section=self.simulated)
         self.screen, self.modulator = FakeScreen(), None
         self.closed = False

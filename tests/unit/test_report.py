@@ -58,6 +58,7 @@ def make_run(folder, *, simulated=True, partial=False, lean=False, title="A <tit
                 "labels": {"escape": {"label": "ESCAPE", "measured": "DO-CRIME", "column": "SHORT"}},
                 "bench": {
                     "psf_px": 2.46,
+                    "full_scale": 1023,
                     "layout": ["".join("01"[int(v)] for v in row) for row in fake.layout()],
                 },
                 "scans": {} if lean else {k: [documents.loop_document(loop)] for k, loop in LOOPS.items()},
@@ -191,11 +192,11 @@ def test_page_shows_everything(page):
     assert "A &lt;title&gt; &amp; more" in page
     for word in (
         "SIMULATED", "SPRINT convergence", "Stacked closed-loop PSFs", "Interaction matrices", "Sky time",
-        "Residual wavefront", "last mirror command", "Mean sensor frame", "best gain", "a missed one",
+        "Residual wavefront", "last mirror command", "Mean frame of the sensor", "best gain", "a missed one",
         "α SHORT", "injected", "Signal-to-noise", "Temporal response", "Configuration",
         "&lt;script&gt;alert(1)",
         '<p class="verdict not-usable" role="status">Not usable: not met: a missed one; see the report</p>',
-        "Influence functions that SPRINT has found",
+        "Influence functions that SPRINT has found", "Sensor and mirror", "the camera saturates at 1,023 ADU",
     ):  # fmt: skip
         assert word in page, word
     assert page.count("<figure>") == 13
@@ -408,6 +409,27 @@ def test_documents_are_strict_json():
     document = documents.calibration_document(fake.calibration("escape"))
     assert document["snr"]["median"] > 0
     assert documents.calibration_document(fake.calibration("docrime"))["registration"] is None
+
+
+def test_a_sensor_frame_has_a_scale_in_counts():
+    frame = np.random.default_rng(1).normal(40.0, 5.0, (40, 40))
+    frame[10, 10] = 900.0
+    picture, bar = figures_bench.sensor_frame(frame).axes
+    assert bar.get_ylabel() == "counts [ADU]"
+    (image,) = picture.images
+    assert np.array_equal(image.get_array(), frame), "the colours are those of counts"
+    low, high = bar.get_ylim()
+    assert (low, high) == pytest.approx(tuple(np.percentile(frame, (5, 99.8))))
+    assert image.norm(low + 0.25 * (high - low)) == pytest.approx(0.5), "square root"
+    figures_bench.sensor_frame(np.zeros((8, 8)))
+
+
+def test_units_of_errors_are_those_of_slopes_and_mirror():
+    lenslets = fake.calibration("docrime").matrix
+    pyramid = dataclasses.replace(lenslets, slope_unit="1")
+    for matrix, unit in ((lenslets, "pixel"), (pyramid, "normalised slope")):
+        (_, below) = figures_matrix.errors_per_mode({"DO-CRIME": matrix}).axes
+        assert below.get_ylabel() == f"standard error\n[{unit} per full stroke rms]"
 
 
 def test_the_temporal_response_is_drawn_in_percent():

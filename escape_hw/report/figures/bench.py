@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import PatchCollection
-from matplotlib.colors import Normalize
+from matplotlib.colors import PowerNorm
 from matplotlib.figure import Figure, FigureBase
 from matplotlib.patches import Circle, Rectangle
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, ScalarFormatter
@@ -70,6 +70,8 @@ _HALF, _DECADES = 32, 3.5
 #: Width of the border that holds background only, in pixels.
 _BORDER = 4
 _PSF_MAP, _FRAME_MAP = "inferno", "magma"
+#: Power of the counts that the colours of a frame follow.
+_ROOT = 0.5
 
 
 def stacked_psfs(loops: Mapping[str, LoopResult], psf_px: float | None = None) -> Figure:
@@ -231,15 +233,16 @@ def _mirror_axes(values: NDArray[np.float64]) -> tuple[Figure, Axes, float]:
 def sensor_frame(
     frame: NDArray[np.generic], grid: SensorGeometry | None = None, title: str = "sensor frame"
 ) -> Figure:
-    """A frame of the wavefront sensor with what was found on it."""
+    """A frame of the wavefront sensor with what was found on it, in counts."""
     image = np.asarray(frame, float)
-    figure = style.new_figure(4.9, 4.2)
+    figure = style.new_figure(5.4, 4.2)
     axes = style.style_axes(figure.subplots(), grid=False)
     high = float(np.percentile(image, 99.8))
     low = float(np.percentile(image, 5))
+    limits = (low, max(high, low + 1e-6))
     # A square root brings out the faint spots at the edge of the beam.
-    scaled = np.sqrt(np.clip((image - low) / max(high - low, 1e-12), 0, 1))
-    axes.imshow(scaled, cmap=_FRAME_MAP, interpolation="nearest", norm=Normalize(0, 1))
+    axes.imshow(image, cmap=_FRAME_MAP, interpolation="nearest", norm=PowerNorm(_ROOT, *limits, clip=True))
+    style.colour_bar(figure, [axes], _FRAME_MAP, limits, "counts [ADU]", extend="both", power=_ROOT)
     if grid is not None:
         title = f"{title}, {draw_geometry(grid, axes)}"
     axes.set_title(title, fontsize=9.5)

@@ -71,7 +71,7 @@ def influence_profile(profile: InfluenceProfile) -> Figure:
             low, high = middle - sigma, middle + sigma
             panel.fill_between(profile.radius, low, high, color=colour, alpha=0.3, lw=0)
     panels[1].axhline(0, color=style.INK, lw=1.1, ls="--")
-    for panel, label in zip(panels, ("surface [peak]", "difference from nominal [peak]"), strict=True):
+    for panel, label in zip(panels, ("surface / peak", "difference from nominal / peak"), strict=True):
         style.style_axes(panel).set(xlabel="distance from the actuator [pitches]", ylabel=label)
     panels[0].legend(frameon=False, fontsize=8, labelcolor=style.INK)
     return figure
@@ -110,7 +110,7 @@ def error_curves(curves: Mapping[str, Any]) -> Figure:
                     frames, _positive_or_nan(curves[key][name]), line, lw=1.1, color=style.INK, label=label
                 )
         if name in curves.get("goal", {}):
-            panel.axhline(curves["goal"][name], color=style.MUTED, lw=1.0, ls=":", label="goal")
+            panel.axhline(curves["goal"][name], color=style.SERIES[5], lw=1.2, ls="-.", label="goal")
         style.style_axes(panel).set_title(title, fontsize=9.5)
         panel.set(xlabel="frames", ylabel=f"rms error [{_SHORT_UNITS[unit]}]")
         # Plain numbers of frames: powers of ten are not useful over one decade.

@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import PatchCollection
-from matplotlib.colors import Colormap, Normalize
+from matplotlib.colors import Colormap, PowerNorm
 from matplotlib.figure import Figure, FigureBase
 from matplotlib.patches import Circle
 from numpy.typing import NDArray
@@ -108,10 +108,14 @@ def colour_bar(
     label: str,
     shrink: float = 1.0,
     extend: str = "neither",
+    power: float = 1.0,
 ) -> None:
-    """A slim colour bar next to its axes; ``extend`` names the ends beyond which values are drawn, too."""
+    """A slim colour bar next to its axes.
+
+    ``extend`` names the ends beyond which values are drawn, too; colours follow this ``power`` of the values.
+    """
     bar = figure.colorbar(
-        ScalarMappable(Normalize(*limits), colormap(name)),
+        ScalarMappable(PowerNorm(power, *limits), colormap(name)),
         ax=list(axes),
         fraction=0.025,
         pad=0.015,

@@ -21,7 +21,8 @@ class BenchRecord:
     """Identity of an opened bench, kept after it is closed.
 
     ``applies_twin_section`` is true if mirror and sensor are simulated as ``[twin]`` says, unlike those of a
-    foreign simulation. ``injected`` is the true registration, for reports only: no estimator reads it.
+    foreign simulation. ``full_scale`` is the count at which the sensor's camera saturates. ``injected`` is
+    the true registration, for reports only: no estimator reads it.
     ``request`` holds the options of a run that can be resumed, ``stopped_at`` where a run was aborted.
     """
 
@@ -34,6 +35,7 @@ class BenchRecord:
     layout: tuple[str, ...]
     places_m: tuple[tuple[float, float], ...]
     psf_px: float | None
+    full_scale: int
     applies_twin_section: bool
     injected: Registration | None
     started: datetime = field(default_factory=lambda: datetime.now(UTC))
@@ -59,6 +61,7 @@ class BenchRecord:
             layout=actuator_layout(bench),
             places_m=actuator_positions(bench),
             psf_px=None if science is None else float(science.psf_px),
+            full_scale=bench.wfs.info.full_scale,
             applies_twin_section=is_twin,
             injected=config.twin.registration.to_registration() if is_known else None,
         )
@@ -85,6 +88,7 @@ class BenchRecord:
                 "layout": list(self.layout),
                 "places_m": [list(place) for place in self.places_m],
                 "psf_px": self.psf_px,
+                "full_scale": self.full_scale,
             },
         }
 
