@@ -12,8 +12,13 @@ from study_scripts import import_study
 
 __all__ = ["import_study", "pytest_addoption", "pytest_configure", "pytest_terminal_summary"]
 
-# Shells start background jobs with Ctrl-C ignored, nohup ignores hang-ups; commands under test inherit that.
-for _signal, _handler in ((signal.SIGINT, signal.default_int_handler), (signal.SIGHUP, signal.SIG_DFL)):
+# Shells start background jobs with Ctrl-C and Ctrl-\ ignored, nohup ignores hang-ups; commands inherit that.
+_USUAL = {
+    signal.SIGINT: signal.default_int_handler,
+    signal.SIGQUIT: signal.SIG_DFL,
+    signal.SIGHUP: signal.SIG_DFL,
+}
+for _signal, _handler in _USUAL.items():
     if signal.getsignal(_signal) is signal.SIG_IGN:
         signal.signal(_signal, _handler)
 
