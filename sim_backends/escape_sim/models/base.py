@@ -56,9 +56,13 @@ class DesignModel:
 
     def component_model(self) -> Self:
         """The same model with a single Gaussian, see :class:`HasProfile`."""
+        self._prepare_sensor()
         single = copy.copy(self)
         single._nominal = self._gaussian  # noqa: SLF001
         return single
+
+    def _prepare_sensor(self) -> None:
+        """Compute what models of other mirrors on this sensor share and what is computed on first use."""
 
     @property
     def sub_aperture_m(self) -> float:

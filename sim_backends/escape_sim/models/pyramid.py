@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,6 +17,7 @@ from escape_hw.calibration.modes.bases import build_basis
 from escape_hw.config.sensor import PyramidSection
 from escape_sim.mirror.influence_functions import SINGLE_GAUSSIAN, InfluenceFunctions
 from escape_sim.mirror.mode_surfaces import (
+    DERIVATIVE_KINDS,
     N_DERIVATIVES,
     GaussianFactors,
     mode_derivatives,
@@ -24,7 +26,7 @@ from escape_sim.mirror.mode_surfaces import (
 )
 from escape_sim.models.base import DesignModel
 from escape_sim.models.pyramid_mean_phase import coarse_pixels, estimate_mean_phase, low_order_phases
-from escape_sim.models.pyramid_response import SlopeResponse, slope_response
+from escape_sim.models.pyramid_response import PairCoherence, SlopeResponse, slope_response
 from escape_sim.models.pyramid_turbulence import (
     PokePhase,
     Turbulence,
@@ -62,9 +64,6 @@ _N_SHAPES = 60
 #: derivatives of the y slopes into the x slopes, as a registration shift does. Other patterns displace images
 #: whose sum is used or whose difference does not depend on the phase.
 _DIAGONALS = np.array([1.0, -1.0, -1.0, 1.0])
-
-#: Kinds of the factors along x and y in the derivatives by the positions and by the logarithms of the widths.
-_DERIVATIVE_KINDS = ((1, 0), (0, 1), (2, 0), (0, 2))
 
 
 def nominal_pupils(config: SystemConfig) -> PyramidPupils:
@@ -135,8 +134,9 @@ class PyramidModel(DesignModel):
         self._pupils, self._modes = pupils, basis
         self._modulation = modulation or ModulationPath.circle(pupils.modulation)
         # The optical path changes by twice the surface.
-        scale = 2 * config.devices.dm.stroke_m * 2 * np.pi / config.system.wavelength_m
-        self._pokes = self._measured_pokes(scale) if pupils.pokes else None
+        self._scale = 2 * config.devices.dm.stroke_m * 2 * np.pi / config.system.wavelength_m
+        self._pokes = self._measured_pokes() if pupils.pokes else None
+        self._coherence: PairCoherence | None = None
         self._phases = phases or self._build_turbulence()
         if turbulence is None:
             turbulence = estimate_strength(self.optics(), pupils, self._phases.phases(1.0), self._pokes)
@@ -153,8 +153,6 @@ class PyramidModel(DesignModel):
         self.mean_phase = mean_phase
         if mean_phase is None and self.turbulence and pupils.mean_low_orders is not None:
             self.mean_phase = self._estimate_mean_phase()
-        self._response = self._slope_response(pupils.valid).phase_derivatives
-        self._response *= np.float32(scale)
         self._executor = ThreadPoolExecutor(1, "pyramid-model")
         self._variants: list[PyramidModel] | None = None
         self._shifted_models: dict[tuple[float, float], PyramidModel] = {}
@@ -234,7 +232,7 @@ class PyramidModel(DesignModel):
             return measured
         factors = self._factors(self._nodes, registration, width, derivatives=True)
         matrix = self._slopes(_zonal_surfaces(factors, 0, 0))
-        parts = [self._slopes(_zonal_surfaces(factors, *kinds)) for kinds in _DERIVATIVE_KINDS]
+        parts = [self._slopes(_zonal_surfaces(factors, *kinds)) for kinds in DERIVATIVE_KINDS]
         return matrix, self._combine(factors, parts)
 
     def zonal_components(
@@ -255,7 +253,7 @@ class PyramidModel(DesignModel):
             return matrices, np.zeros((N_DERIVATIVES, *matrices.shape[1:]))
         parts = []
         # The slopes are linear in the surfaces, so only those of the sum are computed.
-        for kinds in _DERIVATIVE_KINDS:
+        for kinds in DERIVATIVE_KINDS:
             surfaces = np.zeros((self._nodes.size, self._nodes.size, self.n_act), np.float32)
             for factor, factors in summed:
                 surfaces += factor * _zonal_surfaces(factors, *kinds)
@@ -325,11 +323,16 @@ class PyramidModel(DesignModel):
         turbulence: float | None = None,
     ) -> PyramidModel:
         """The same model, except for what is given."""
-        return PyramidModel(
+        varied = PyramidModel(
             self._config, pupils or self._pupils, modulation=modulation or self._modulation,
             turbulence=self.turbulence if turbulence is None else turbulence, basis=self._modes,
             phases=self._phases, mean_phase=self.mean_phase,
         )  # fmt: skip
+        same_pupil = np.array_equal(varied._pupil.amplitude != 0, self._pupil.amplitude != 0)
+        if modulation is None and turbulence is None and same_pupil:
+            # Displaced images see the same wavefronts.
+            varied._coherence = self._pair_coherence()
+        return varied
 
     def _strength_uncertainty(self) -> NDArray[np.float64]:
         """Registration error ``(5,)`` by the strength of the turbulence, where it is not fitted."""
@@ -380,14 +383,14 @@ class PyramidModel(DesignModel):
         distances = sample_distances(len(pupil.coordinates_m), pupil.pixel_m) / self._config.system.pupil_m
         return Turbulence(_OUTER_SCALE, distances, pupil.lit, modes)
 
-    def _measured_pokes(self, scale: float) -> PokePhase:
-        """Pokes of the measured rms; ``scale`` converts full stroke of surface to radians of phase."""
+    def _measured_pokes(self) -> PokePhase:
+        """Pokes of the measured rms."""
         m2c = self._basis()
         surfaces, lit, _ = self.influence_functions()
         # Pokes are uniformly distributed, with an rms of 1 / sqrt(3) of their maximum.
         max_amplitude = self._config.calibration.poke_command / np.abs(m2c).max(axis=0) / np.sqrt(3)
         return PokePhase.from_rms(
-            self._pupils.pokes, max_amplitude, scale * np.tensordot(m2c.T, surfaces, 1), lit
+            self._pupils.pokes, max_amplitude, self._scale * np.tensordot(m2c.T, surfaces, 1), lit
         )
 
     def _slope_response(self, pixels: NDArray[np.bool_]) -> SlopeResponse:
@@ -397,7 +400,7 @@ class PyramidModel(DesignModel):
         shape = self._config.devices.wfs.region[:1:-1]
         grid = next_fast_length(max(shape), samples)
         region = GridRegion(pupils.centres_px, shape, grid, samples)
-        structure, pairs = None, self._pair_structure()
+        structure, pairs = None, self._pair_coherence()
         if pairs is None and self.turbulence:
             structure = self._phases.structure(self.turbulence)
         return slope_response(
@@ -414,6 +417,13 @@ class PyramidModel(DesignModel):
             self._slope_response(pixels), pixels, self._pupils, self._nodes / radius_m,
             self._pupil.coordinates_m / radius_m,
         )  # fmt: skip
+
+    def _pair_coherence(self) -> PairCoherence | None:
+        """Coherence of all pairs of lit samples, kept; ``None`` where the phase is stationary."""
+        if self._coherence is None and (structure := self._pair_structure()) is not None:
+            diameter = float(self._pupil.n_sub * self._pupil.n_pix)
+            self._coherence = PairCoherence(self._pupil.amplitude != 0, diameter, self._modulation, structure)
+        return self._coherence
 
     def _pair_structure(self) -> NDArray[np.float32] | None:
         """Structure function of all pairs of lit samples; ``None`` where the phase is stationary.
@@ -434,6 +444,16 @@ class PyramidModel(DesignModel):
             self._pupils.centres_px, self._config.devices.wfs.region[:1:-1], self._modulation,
             samples=self._pupil.n_pix,
         )  # fmt: skip
+
+    @cached_property
+    def _response(self) -> NDArray[np.float32]:
+        """Derivatives of the slopes by the surface at the nodes; the modal basis needs none."""
+        response = self._slope_response(self._pupils.valid).phase_derivatives
+        response *= np.float32(self._scale)
+        return response
+
+    def _prepare_sensor(self) -> None:
+        _ = self._response
 
     # ------------------------------------------------------------------ mirror
     def _slopes(self, surfaces: NDArray[np.floating]) -> NDArray[np.float64]:

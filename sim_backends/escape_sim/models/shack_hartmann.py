@@ -21,7 +21,7 @@ from escape_hw.api.sensor import SubApertureGrid
 from escape_hw.config.sensor import ShackHartmannSection
 from escape_hw.pipeline.slopes.shack_hartmann import subaperture_windows
 from escape_sim.mirror.influence_functions import InfluenceFunctions
-from escape_sim.mirror.mode_surfaces import N_DERIVATIVES, GaussianFactors, mode_surfaces
+from escape_sim.mirror.mode_surfaces import DERIVATIVE_KINDS, N_DERIVATIVES, GaussianFactors, mode_surfaces
 from escape_sim.models.base import DesignModel
 from escape_sim.optics.pupil import PupilGeometry, nominal_flux, pupil_from_lenslets
 from escape_sim.optics.shack_hartmann import field_pixels, first_pixels, lenslet_transform
@@ -336,6 +336,10 @@ def _fit_lattice(grid: SubApertureGrid) -> tuple[tuple[float, float], tuple[floa
 NODES = 6
 #: Lenslets per axis whose light a window receives.
 _LENSLETS_ACROSS = 3
+#: Nodes that are weighted at once.
+_AT_ONCE = 4
+#: Part of a surface, in roundings of its peak, that is not computed.
+_NEGLIGIBLE_SHARE = 0.01
 
 
 class SlopeOperator:
@@ -354,15 +358,25 @@ class SlopeOperator:
         sub_aperture_m: float,
     ) -> None:
         rows, columns = np.nonzero(valid)
-        n_sub = len(valid)
+        n_sub, n_valid = len(valid), len(rows)
         p = next(iter(weights.values())).shape[-1]
         nodes, interpolation = _lenslet_nodes(p)
-        k = nodes.size
-        table = np.zeros((rows.size, 2, _LENSLETS_ACROSS, k, _LENSLETS_ACROSS, k))
-        for (down, right), block in weights.items():
-            at_nodes = interpolation.T @ block @ interpolation
-            table[:, :, down + 1, :, right + 1, :] = at_nodes.transpose(1, 0, 2, 3)
-        self._table = table.reshape(rows.size, 2, _LENSLETS_ACROSS * k, _LENSLETS_ACROSS * k)
+        k, across = nodes.size, n_sub + 2
+        table = np.zeros((n_valid, 2, _LENSLETS_ACROSS, k, _LENSLETS_ACROSS, k))
+        # The same by lenslet: weights on the slopes of the windows that receive its light, and their numbers.
+        by_lenslet = np.zeros((across, across, len(weights), 2, k * k + -k * k % _AT_ONCE))
+        slopes = np.full((across, across, len(weights), 2), -1)
+        for number, ((down, right), block) in enumerate(weights.items()):
+            at_nodes = (interpolation.T @ block @ interpolation).transpose(1, 0, 2, 3)
+            table[:, :, down + 1, :, right + 1, :] = at_nodes
+            at_nodes = at_nodes.reshape(n_valid, 2, -1)
+            by_lenslet[rows + 1 + down, columns + 1 + right, number, :, : k * k] = at_nodes
+            slopes[rows + 1 + down, columns + 1 + right, number] = np.arange(2 * n_valid).reshape(2, -1).T
+        self._table = table.reshape(n_valid, 2, _LENSLETS_ACROSS * k, _LENSLETS_ACROSS * k)
+        self._lenslets = np.argwhere(by_lenslet.any(axis=(2, 3, 4)))
+        at = tuple(self._lenslets.T)
+        self._by_lenslet = by_lenslet[at].reshape(len(self._lenslets), 2 * len(weights), -1)
+        self._slopes_of_lenslet = slopes[at].reshape(len(self._lenslets), -1)
         # Lenslets beyond the edge have nodes with zero weights.
         lattice = np.arange(-1, n_sub + 1) - (n_sub - 1) / 2
         self.nodes_m = ((lattice[:, None] + nodes) * sub_aperture_m).ravel()
@@ -375,7 +389,8 @@ class SlopeOperator:
         Every node is weighted once per window, which is efficient for a few surfaces.
         """
         out = np.zeros((2, len(self._table), surfaces.shape[2]), surfaces.dtype)
-        _apply_to_surfaces(self._weights(surfaces.dtype), self._first_y, self._first_x, surfaces, out)
+        table = self._cast("windows", self._table, surfaces.dtype)
+        _apply_to_surfaces(table, self._first_y, self._first_x, surfaces, out)
         return out.reshape(2 * len(self._table), -1)
 
     def zonal(self, factors: GaussianFactors, *, derivatives: bool = False) -> NDArray[np.floating]:
@@ -384,18 +399,41 @@ class SlopeOperator:
         ``n`` is 1, or 5 with derivatives: the slopes and their derivatives by the position along x and
         y and by the logarithm of the width along x and y.
         """
-        x, y = factors.along_x, factors.along_y
-        kinds = 3 if derivatives else 1
-        side = np.ascontiguousarray(x[:kinds].transpose(1, 0, 2)).reshape(x.shape[1], -1)
-        out = np.zeros((5 if derivatives else 1, 2, len(self._table), x.shape[2]), x.dtype)
-        _apply_to_factors(self._weights(x.dtype), self._first_y, self._first_x, side, y, out)
-        return out.reshape(len(out), 2 * len(self._table), -1)
+        kinds = ((0, 0), *DERIVATIVE_KINDS) if derivatives else ((0, 0),)
+        return self.side_by_side([factors.terms(*kind) for kind in kinds])
 
-    def _weights(self, dtype: DTypeLike) -> NDArray[np.floating]:
-        kind = np.dtype(dtype).str
-        if kind not in self._tables_by_dtype:
-            self._tables_by_dtype[kind] = np.ascontiguousarray(self._table, dtype=np.dtype(kind))
-        return self._tables_by_dtype[kind]
+    def side_by_side(
+        self, sums: Sequence[tuple[NDArray[np.floating], NDArray[np.floating]]]
+    ) -> NDArray[np.floating]:
+        """Slopes ``(n, n_slopes, n_act)`` of sums of equally many products, computed as one."""
+        x, y = (np.concatenate(parts, axis=2) for parts in zip(*sums, strict=True))
+        out = self.sum_of_products(x, y)
+        return np.ascontiguousarray(out.reshape(len(out), len(sums), -1).transpose(1, 0, 2))
+
+    def sum_of_products(self, x: NDArray[np.floating], y: NDArray[np.floating]) -> NDArray[np.floating]:
+        """Slopes ``(n_slopes, n_act)`` of a sum of products of functions of x and of y.
+
+        The functions ``(n_terms, n_nodes, n_act)`` are given at the nodes. The slopes are linear in the
+        surfaces, so the weights are applied once to the sum, and only where it is not negligible.
+        """
+        dtype, n_nodes = x.dtype, self._table.shape[2] // _LENSLETS_ACROSS
+        # Largest values on each row and column of lenslets.
+        peaks = [np.abs(f).reshape(len(f), -1, n_nodes, f.shape[2]).max(axis=2) for f in (x, y)]
+        highest = (peaks[0].max(axis=1) * peaks[1].max(axis=1)).max(axis=0)
+        negligible = _NEGLIGIBLE_SHARE * np.finfo(dtype).eps * highest
+        out = np.zeros((2 * len(self._table), x.shape[2]), dtype)
+        _apply_to_products(
+            self._cast("lenslets", self._by_lenslet, dtype), self._slopes_of_lenslet, self._lenslets,
+            np.ascontiguousarray(x), np.ascontiguousarray(y), *peaks, negligible, out,
+        )  # fmt: skip
+        return out
+
+    def _cast(self, name: str, table: NDArray[np.float64], dtype: DTypeLike) -> NDArray[np.floating]:
+        """A table in a precision, kept by its name."""
+        key = name + np.dtype(dtype).str
+        if key not in self._tables_by_dtype:
+            self._tables_by_dtype[key] = np.ascontiguousarray(table, dtype=np.dtype(dtype))
+        return self._tables_by_dtype[key]
 
 
 def _lenslet_nodes(p: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -428,24 +466,49 @@ def _apply_to_surfaces(table, first_y, first_x, surfaces, out):  # type: ignore[
 
 
 @njit(cache=True, fastmath=True, nogil=True)
-def _apply_to_factors(table, first_y, first_x, side, y, out):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Sums over both factors, ``side (n_x, kinds * n_act)`` and ``y (3, n_y, n_act)``."""
-    size, n_act = table.shape[2], y.shape[2]
-    # Products this small run on one thread in any linear-algebra library.
-    lines = np.empty((2 * size, side.shape[1]), side.dtype)
-    for s in range(table.shape[0]):
-        np.dot(table[s].reshape(2 * size, size), side[first_x[s] : first_x[s] + size], lines)
-        for axis in range(2):
-            for q in range(size):
-                line, row = lines[axis * size + q], first_y[s] + q
-                for a in range(n_act):
-                    out[0, axis, s, a] += y[0, row, a] * line[a]
-                if out.shape[0] > 1:
-                    for a in range(n_act):
-                        out[1, axis, s, a] += y[0, row, a] * line[n_act + a]
-                        out[2, axis, s, a] += y[1, row, a] * line[a]
-                        out[3, axis, s, a] += y[0, row, a] * line[2 * n_act + a]
-                        out[4, axis, s, a] += y[2, row, a] * line[a]
+def _apply_to_products(  # type: ignore[no-untyped-def]  # pragma: no cover
+    table, slopes, lenslets, x, y, peaks_x, peaks_y, negligible, out
+):
+    """Weighted sums of ``sum_t y_t x_t`` into ``out (n_slopes, n_act)``, one lenslet after another.
+
+    In each, the actuators from the first to the last with a product of peaks above ``negligible (n_act,)``
+    count.
+    """
+    n_terms, _, n_act = x.shape
+    n_slopes, n_nodes = table.shape[1:]
+    k = x.shape[1] // peaks_x.shape[1]
+    surface = np.zeros((n_nodes, n_act), x.dtype)
+    for s in range(len(lenslets)):
+        row, column = lenslets[s]
+        first, last = n_act, 0
+        for t in range(n_terms):
+            for a in range(n_act):
+                if peaks_x[t, column, a] * peaks_y[t, row, a] > negligible[a]:
+                    first, last = min(first, a), max(last, a + 1)
+        if first >= last:
+            continue
+        surface[: k * k, first:last] = 0
+        for t in range(n_terms):
+            for q in range(k):
+                f = y[t, row * k + q, first:last]
+                for r in range(k):
+                    line, g = surface[q * k + r, first:last], x[t, column * k + r, first:last]
+                    for a in range(line.size):
+                        line[a] += f[a] * g[a]
+        # Both slopes of a window, by :data:`_AT_ONCE` nodes: faster than a linear-algebra library.
+        for i in range(0, n_slopes, 2):
+            if slopes[s, i] < 0:
+                continue
+            along_x, along_y = out[slopes[s, i], first:last], out[slopes[s, i + 1], first:last]
+            u, v = table[s, i], table[s, i + 1]
+            for q in range(0, n_nodes, 4):
+                f0, f1 = surface[q, first:last], surface[q + 1, first:last]
+                f2, f3 = surface[q + 2, first:last], surface[q + 3, first:last]
+                u0, u1, u2, u3 = u[q], u[q + 1], u[q + 2], u[q + 3]
+                v0, v1, v2, v3 = v[q], v[q + 1], v[q + 2], v[q + 3]
+                for a in range(along_x.size):
+                    along_x[a] += u0 * f0[a] + u1 * f1[a] + u2 * f2[a] + u3 * f3[a]
+                    along_y[a] += v0 * f0[a] + v1 * f1[a] + v2 * f2[a] + v3 * f3[a]
 
 
 #: Up to this many modes, forming their surfaces is faster than the slopes of all actuators.
@@ -528,6 +591,9 @@ class ShackHartmannModel(DesignModel):
         weights = slope_weights(self._config, self._grid, self._pupil, self._wavefronts_m, self._overlap)
         return SlopeOperator(weights, self._grid.valid, self._pupil.sub_aperture_m)
 
+    def _prepare_sensor(self) -> None:
+        _ = self._slopes
+
     def influence_functions(self) -> tuple[NDArray[np.float64], NDArray[np.bool_], float]:
         """Nominal influence functions for the modal basis, see :class:`SyntheticModel`."""
         # Half the sampling suffices for shapes as smooth as these.
@@ -546,17 +612,19 @@ class ShackHartmannModel(DesignModel):
             surfaces = np.moveaxis(self._surfaces(self._slopes.nodes_m, registration, width), 0, 2).copy()
             return np.asarray(self._slopes.slopes(surfaces) * self._opd_per_command_m)
         factors = self._factors(self._slopes.nodes_m, registration, width, np.float64)
-        return np.asarray(factors.sum_terms(self._slopes.zonal(factors)[0]) * self._opd_per_command_m)
+        return np.asarray(self._slopes.zonal(factors)[0] * self._opd_per_command_m)
 
     def zonal_sum(
         self, functions: Sequence[tuple[NDArray[np.float64] | float, Registration, float]]
     ) -> NDArray[np.float64]:
         """Slopes of a sum of functions ``(n_slopes, n_act)``, see :class:`SummingModel`; single precision."""
-        total = np.zeros((2 * self._grid.n_valid, self.n_act))
+        x, y = [], []
         for factor, registration, width in functions:
-            factors = self._factors(self._slopes.nodes_m, registration, width)
-            total += factor * factors.sum_terms(self._slopes.zonal(factors)[0])
-        return total * self._opd_per_command_m
+            along_x, along_y = self._factors(self._slopes.nodes_m, registration, width).terms(0, 0)
+            x.append(along_x)
+            y.append(along_y * np.asarray(factor, np.float32))
+        total = self._slopes.sum_of_products(np.concatenate(x), np.concatenate(y))
+        return np.asarray(total * self._opd_per_command_m, dtype=float)
 
     def zonal_jacobian(
         self, registration: Registration, width: float = 1.0
@@ -569,7 +637,7 @@ class ShackHartmannModel(DesignModel):
         if measured is not None:
             return measured
         factors = self._factors(self._slopes.nodes_m, registration, width, derivatives=True)
-        parts = factors.sum_terms(self._slopes.zonal(factors, derivatives=True))
+        parts = self._slopes.zonal(factors, derivatives=True)
         parts *= np.float32(self._opd_per_command_m)
         return parts[0].astype(float), _combine(factors.position, factors.log_width, parts[1:])
 
@@ -577,24 +645,26 @@ class ShackHartmannModel(DesignModel):
         self, registration: Registration, width: float, functions: Sequence[tuple[float, float]]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Functions of several widths, and derivatives of their sum, see :class:`SummingModel`."""
-        matrices, summed = [], []
-        for share, relative in functions:
-            derivatives = share != 0
-            factors = self._factors(
-                self._slopes.nodes_m, registration, width * relative, derivatives=derivatives
-            )
-            parts = factors.sum_terms(self._slopes.zonal(factors, derivatives=derivatives))
-            parts *= np.float32(self._opd_per_command_m)
-            matrices.append(parts[0].astype(float))
-            if derivatives:
-                # The logarithms of all widths change alike.
-                log_width = factors.log_width.copy()
-                log_width[5] = 1 / width
-                summed.append((factors.position, log_width, np.float32(share) * parts[1:]))
+        each = [
+            self._factors(self._slopes.nodes_m, registration, width * relative, derivatives=share != 0)
+            for share, relative in functions
+        ]
+        opd = np.float32(self._opd_per_command_m)
+        matrices = np.stack([(self._slopes.zonal(one)[0] * opd).astype(float) for one in each])
+        summed = [
+            (np.float32(share), one) for (share, _), one in zip(functions, each, strict=True) if share != 0
+        ]
         if not summed:
-            return np.stack(matrices), np.zeros((N_DERIVATIVES, *matrices[0].shape))
-        total = np.sum([parts for _, _, parts in summed], axis=0)
-        return np.stack(matrices), _combine(*summed[0][:2], total)
+            return matrices, np.zeros((N_DERIVATIVES, *matrices.shape[1:]))
+        sums = []
+        for kinds in DERIVATIVE_KINDS:
+            x, y = zip(*(one.terms(*kinds) for _, one in summed), strict=True)
+            weighted = [share * part for (share, _), part in zip(summed, y, strict=True)]
+            sums.append((np.concatenate(x), np.concatenate(weighted)))
+        # The logarithms of all widths change alike.
+        log_width = summed[0][1].log_width.copy()
+        log_width[5] = 1 / width
+        return matrices, _combine(summed[0][1].position, log_width, opd * self._slopes.side_by_side(sums))
 
     def modal_matrix(
         self, registration: Registration, m2c: NDArray[np.float64], width: float = 1.0
@@ -607,7 +677,7 @@ class ShackHartmannModel(DesignModel):
             return np.asarray(
                 self._slopes.slopes(mode_surfaces(factors, m2c)) * self._opd_per_command_m, dtype=float
             )
-        return np.asarray(factors.sum_terms(self._slopes.zonal(factors)[0]) @ (m2c * self._opd_per_command_m))
+        return np.asarray(self._slopes.zonal(factors)[0] @ (m2c * self._opd_per_command_m))
 
     def modal_jacobian(
         self, registration: Registration, m2c: NDArray[np.float64], width: float = 1.0
@@ -617,7 +687,7 @@ class ShackHartmannModel(DesignModel):
             matrix, derivatives = self.zonal_jacobian(registration, width)
             return matrix @ m2c, derivatives @ m2c
         factors = self._factors(self._slopes.nodes_m, registration, width, derivatives=True)
-        parts = factors.sum_terms(self._slopes.zonal(factors, derivatives=True))
+        parts = self._slopes.zonal(factors, derivatives=True)
         modes = (m2c * self._opd_per_command_m).astype(np.float32)
         out = np.zeros((N_DERIVATIVES, parts.shape[1], m2c.shape[1]))
         for p in range(N_DERIVATIVES):
