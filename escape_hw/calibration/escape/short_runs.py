@@ -94,8 +94,9 @@ def calibrate_short_run(
     fit = yield from fit_recorded_frames(bench, record, template, model, order)
     n_frames = int(record[0].size)
     result = _build_result(
-        bench, fit, geometry, model, m2c, frames=n_frames, lost=int(record[0][-1] - record[0][0]) + 1 - n_frames,
-        amplitude=amplitude, poke=poke, order=order, shortened=acquisition.shortened,
+        bench, fit, geometry, model, m2c, frames=n_frames,
+        lost=int(record[0][-1] - record[0][0]) + 1 - n_frames, amplitude=amplitude, poke=poke, order=order,
+        shortened=acquisition.shortened,
     )  # fmt: skip
     return replace(
         result,
@@ -203,13 +204,14 @@ def calibrate_short_run_closed_loop(
     unknown = slice(c.whiten_order + c.lags)
     data.present[unknown], data.slopes[unknown] = False, 0
     registration = closed_loop.registration
+    model = bench.model(geometry)
     fit = yield from fit_telemetry(
-        data, closed_loop.matrix, bench.model(geometry), order=order, lags=c.lags,
+        data, closed_loop.matrix, model, order=order, lags=c.lags,
         options=sprint_options_from_config(c), known_response=closed_loop.response,
         start=None if registration is None else registration.registration,
     )  # fmt: skip
     result = _build_result(
-        bench, fit, geometry, closed_loop.matrix.m2c, frames=frames, lost=buffer.lost,
+        bench, fit, geometry, model, closed_loop.matrix.m2c, frames=frames, lost=buffer.lost,
         amplitude=amplitude, poke=poke, order=order, shortened=loop.record.shortened,
     )  # fmt: skip
     notes = collect_loop_notes(loop.record, bench.wfs.settings.frame_rate_hz)

@@ -15,6 +15,10 @@ from escape_sim.mirror.influence_functions import NEGLIGIBLE_BEYOND, InfluenceFu
 N_DERIVATIVES = 6
 #: Kinds of the factors along x and y in the derivatives by the positions and by the logarithms of the widths.
 DERIVATIVE_KINDS = ((1, 0), (0, 1), (2, 0), (0, 2))
+#: The same after those of the matrix itself.
+MATRIX_AND_DERIVATIVE_KINDS = ((0, 0), *DERIVATIVE_KINDS)
+#: Functions of x ``(n_terms, n_x, n_act)`` and of y ``(n_terms, n_y, n_act)``, whose products are summed.
+Products = tuple[NDArray[np.floating], NDArray[np.floating]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,8 +44,8 @@ class GaussianFactors:
         """Number of Gaussians of the profile."""
         return int(self.along_x.shape[2] // self.position.shape[2])
 
-    def terms(self, kind_x: int, kind_y: int) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
-        """Factors of two kinds by Gaussian: ``(n_terms, n_x, n_act)`` and ``(n_terms, n_y, n_act)``."""
+    def terms(self, kind_x: int, kind_y: int) -> Products:
+        """Factors of two kinds, one product per Gaussian."""
         x, y = (
             f.reshape(len(f), self.n_terms, -1).transpose(1, 0, 2)
             for f in (self.along_x[kind_x], self.along_y[kind_y])
@@ -91,7 +95,9 @@ def gaussian_factors(
     along_x, along_y = (np.empty((n_kinds, len(at_m), len(at)), dtype) for at_m in (x_m, y_m))
     _fill_factors(x_m, at[:, 0], sigma * stretch[0], np.ones(len(at)), along_x)
     _fill_factors(y_m, at[:, 1], sigma * stretch[1], float(influence.gain) * shares, along_y)
-    position, log_width = _parameter_derivatives(influence, registration, sub_aperture_m, stretch)
+    position, log_width = np.zeros((N_DERIVATIVES, 2, influence.n_act)), np.zeros((N_DERIVATIVES, 2))
+    if derivatives:
+        position, log_width = _parameter_derivatives(influence, registration, sub_aperture_m, stretch)
     return GaussianFactors(along_x, along_y, position.astype(dtype), log_width)
 
 
@@ -132,6 +138,23 @@ def _parameter_derivatives(
     log_width[3, 0], log_width[4, 1] = 0.01 / stretch
     log_width[5] = 1 / float(influence.width)
     return position, log_width
+
+
+def combine_derivatives(
+    position: NDArray[np.floating], log_width: NDArray[np.floating], parts: NDArray[np.floating]
+) -> NDArray[np.float64]:
+    """Derivatives by the parameters ``(6, n_slopes, n_act)`` from ``parts (4, n_slopes, n_act)``.
+
+    The parts are the derivatives by the positions along x and y and by the logarithms of the widths.
+    """
+    out = np.empty((N_DERIVATIVES, *parts.shape[1:]))
+    for p, ((along_x, along_y), (width_x, width_y)) in enumerate(zip(position, log_width, strict=True)):
+        out[p] = parts[0] * along_x + parts[1] * along_y
+        if width_x:
+            out[p] += parts[2] * width_x
+        if width_y:
+            out[p] += parts[3] * width_y
+    return out
 
 
 def mode_surfaces(factors: GaussianFactors, m2c: NDArray[np.floating]) -> NDArray[np.floating]:

@@ -17,14 +17,13 @@ from escape_hw.calibration.modes.bases import build_basis
 from escape_hw.config.sensor import PyramidSection
 from escape_sim.mirror.influence_functions import SINGLE_GAUSSIAN, InfluenceFunctions
 from escape_sim.mirror.mode_surfaces import (
-    DERIVATIVE_KINDS,
     N_DERIVATIVES,
-    GaussianFactors,
+    Products,
     mode_derivatives,
     mode_surfaces,
     surface_nodes,
 )
-from escape_sim.models.base import DesignModel
+from escape_sim.models.base import SummingDesignModel
 from escape_sim.models.pyramid_mean_phase import coarse_pixels, estimate_mean_phase, low_order_phases
 from escape_sim.models.pyramid_response import PairCoherence, SlopeResponse, slope_response
 from escape_sim.models.pyramid_turbulence import (
@@ -78,15 +77,7 @@ def nominal_pupils(config: SystemConfig) -> PyramidPupils:
     )  # fmt: skip
 
 
-def _zonal_surfaces(factors: GaussianFactors, kind_x: int, kind_y: int) -> NDArray[np.floating]:
-    """Products ``(n_y, n_x, n_act)`` of two factors, summed over the Gaussians of the profile."""
-    x, y = (
-        f.reshape(len(f), factors.n_terms, -1) for f in (factors.along_x[kind_x], factors.along_y[kind_y])
-    )
-    return np.asarray(np.einsum("yka,xka->yxa", y, x))
-
-
-class PyramidModel(DesignModel):
+class PyramidModel(SummingDesignModel):
     """Small-signal slopes of a modulated pyramid with a mirror of Gaussian actuators.
 
     The derivatives of the slopes by the phase are computed once, at a flat wavefront or averaged over
@@ -190,18 +181,8 @@ class PyramidModel(DesignModel):
         """Slopes per unit command ``(n_slopes, n_act)``, see :class:`SyntheticModel`; single precision."""
         if not self._is_separable(registration):
             return self._slopes(np.moveaxis(self._surfaces(self._nodes, registration, width), 0, 2))
-        factors = self._factors(self._nodes, registration, width)
-        return self._slopes(_zonal_surfaces(factors, 0, 0))
-
-    def zonal_sum(
-        self, functions: Sequence[tuple[NDArray[np.float64] | float, Registration, float]]
-    ) -> NDArray[np.float64]:
-        """Slopes of a sum of influence functions ``(n_slopes, n_act)``, see :class:`SummingModel`."""
-        surfaces = np.zeros((self._nodes.size, self._nodes.size, self.n_act), np.float32)
-        for factor, registration, width in functions:
-            factors = self._factors(self._nodes, registration, width)
-            surfaces += _zonal_surfaces(factors, 0, 0) * np.asarray(factor, np.float32)
-        return self._slopes(surfaces)
+        products = self._factors(registration, width).terms(0, 0)
+        return np.asarray(self._slopes_of_sums([products])[0])
 
     def modal_matrix(
         self, registration: Registration, m2c: NDArray[np.float64], width: float = 1.0
@@ -209,7 +190,7 @@ class PyramidModel(DesignModel):
         """Slopes per unit mode ``(n_slopes, n_modes)``, see :class:`DifferentiableModel`."""
         if not self._is_separable(registration):
             return self.zonal_matrix(registration, width) @ m2c
-        return self._slopes(mode_surfaces(self._factors(self._nodes, registration, width), m2c))
+        return self._slopes(mode_surfaces(self._factors(registration, width), m2c))
 
     def modal_jacobian(
         self, registration: Registration, m2c: NDArray[np.float64], width: float = 1.0
@@ -218,7 +199,7 @@ class PyramidModel(DesignModel):
         if not isinstance(self._nominal, InfluenceFunctions):
             matrix, derivatives = self.zonal_jacobian(registration, width)
             return matrix @ m2c, derivatives @ m2c
-        surfaces = mode_derivatives(self._factors(self._nodes, registration, width, derivatives=True), m2c)
+        surfaces = mode_derivatives(self._factors(registration, width, derivatives=True), m2c)
         parts = self._slopes(surfaces.reshape(*surfaces.shape[:2], -1))
         parts = parts.reshape(-1, 1 + N_DERIVATIVES, m2c.shape[1]).transpose(1, 0, 2)
         return parts[0], parts[1:]
@@ -228,47 +209,7 @@ class PyramidModel(DesignModel):
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Zonal matrix and its derivatives, see :class:`DifferentiableModel`."""
         measured = self._measured_jacobian(self._nodes, registration, width, self._slopes)
-        if measured is not None:
-            return measured
-        factors = self._factors(self._nodes, registration, width, derivatives=True)
-        matrix = self._slopes(_zonal_surfaces(factors, 0, 0))
-        parts = [self._slopes(_zonal_surfaces(factors, *kinds)) for kinds in DERIVATIVE_KINDS]
-        return matrix, self._combine(factors, parts)
-
-    def zonal_components(
-        self, registration: Registration, width: float, functions: Sequence[tuple[float, float]]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Functions of several widths, and derivatives of their sum, see :class:`SummingModel`."""
-        each = [
-            self._factors(self._nodes, registration, width * relative, derivatives=share != 0)
-            for share, relative in functions
-        ]
-        matrices = np.stack([self._slopes(_zonal_surfaces(factors, 0, 0)) for factors in each])
-        summed = [
-            (np.float32(share), factors)
-            for (share, _), factors in zip(functions, each, strict=True)
-            if share != 0
-        ]
-        if not summed:
-            return matrices, np.zeros((N_DERIVATIVES, *matrices.shape[1:]))
-        parts = []
-        # The slopes are linear in the surfaces, so only those of the sum are computed.
-        for kinds in DERIVATIVE_KINDS:
-            surfaces = np.zeros((self._nodes.size, self._nodes.size, self.n_act), np.float32)
-            for factor, factors in summed:
-                surfaces += factor * _zonal_surfaces(factors, *kinds)
-            parts.append(self._slopes(surfaces))
-        # The logarithms of all widths change alike.
-        log_width = summed[0][1].log_width.copy()
-        log_width[5] = 1 / width
-        return matrices, self._combine(replace(summed[0][1], log_width=log_width), parts)
-
-    def _combine(self, factors: GaussianFactors, parts: list[NDArray[np.float64]]) -> NDArray[np.float64]:
-        """Derivatives by the parameters from those by positions and by logarithms of the widths."""
-        derivatives = np.concatenate(
-            [factors.position, np.repeat(factors.log_width[:, :, None], self.n_act, 2)], axis=1
-        )
-        return np.asarray(np.einsum("pka,ksa->psa", derivatives, np.stack(parts), optimize=True))
+        return self._gaussian_jacobian(registration, width) if measured is None else measured
 
     def with_pupil_shift(self, shift_x: float, shift_y: float) -> PyramidModel:
         """The model with shifted images under the same turbulence, see :class:`HasPupilShift`."""
@@ -456,6 +397,14 @@ class PyramidModel(DesignModel):
         _ = self._response
 
     # ------------------------------------------------------------------ mirror
+    def _coordinates(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        return self._nodes, self._nodes
+
+    def _slopes_of_sums(self, sums: Sequence[Products]) -> NDArray[np.floating]:
+        surfaces = [np.einsum("tya,txa->yxa", y, x) for x, y in sums]
+        slopes = self._slopes(np.concatenate(surfaces, axis=2))
+        return slopes.reshape(len(slopes), len(sums), -1).transpose(1, 0, 2)
+
     def _slopes(self, surfaces: NDArray[np.floating]) -> NDArray[np.float64]:
         """Slopes ``(n_slopes, k)`` of surfaces ``(m, m, k)`` at the nodes, in fractions of full stroke."""
         # For few modes reading the response from memory dominates: two threads read one half each.

@@ -118,7 +118,7 @@ class PairCoherence:
         half, odd = divmod(len(coherence), 2)
         is_symmetric = not odd and np.array_equal(lit, lit[::-1, ::-1])
         if is_symmetric and np.abs(coherence - coherence[::-1, ::-1]).max() < _ROUNDING:
-            within, across = coherence[:half, :half], coherence[:half, :half - 1:-1]
+            within, across = coherence[:half, :half], coherence[:half, : half - 1 : -1]
             self._parts = (within + across) / 2, (within - across) / 2
 
     def products(self, fields: NDArray[np.complex64]) -> NDArray[np.complex64]:
@@ -131,7 +131,7 @@ class PairCoherence:
             parts = parts @ self._parts[0]
         else:
             half = parts.shape[1] // 2
-            first, second = parts[:, :half], parts[:, :half - 1:-1]
+            first, second = parts[:, :half], parts[:, : half - 1 : -1]
             even, odd = (first + second) @ self._parts[0], (first - second) @ self._parts[1]
             parts = np.concatenate([even + odd, (even - odd)[:, ::-1]], axis=1)
         return np.asarray(parts[:count] + 1j * parts[count:])

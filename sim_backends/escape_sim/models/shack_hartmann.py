@@ -12,8 +12,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numba import njit
-from numpy.typing import DTypeLike, NDArray
+from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
 from escape_hw.api.registration import Registration
@@ -21,8 +20,14 @@ from escape_hw.api.sensor import SubApertureGrid
 from escape_hw.config.sensor import ShackHartmannSection
 from escape_hw.pipeline.slopes.shack_hartmann import subaperture_windows
 from escape_sim.mirror.influence_functions import InfluenceFunctions
-from escape_sim.mirror.mode_surfaces import DERIVATIVE_KINDS, N_DERIVATIVES, GaussianFactors, mode_surfaces
-from escape_sim.models.base import DesignModel
+from escape_sim.mirror.mode_surfaces import (
+    MATRIX_AND_DERIVATIVE_KINDS,
+    N_DERIVATIVES,
+    Products,
+    mode_surfaces,
+)
+from escape_sim.models.base import SummingDesignModel
+from escape_sim.models.slope_operator import SlopeOperator
 from escape_sim.optics.pupil import PupilGeometry, nominal_flux, pupil_from_lenslets
 from escape_sim.optics.shack_hartmann import field_pixels, first_pixels, lenslet_transform
 
@@ -331,186 +336,6 @@ def _fit_lattice(grid: SubApertureGrid) -> tuple[tuple[float, float], tuple[floa
     return out[0], out[1]
 
 
-#: Nodes across a lenslet that interpolate a mirror surface: with 6, the error for a Gaussian two
-#: lenslets wide is 1e-8 of its slope.
-NODES = 6
-#: Lenslets per axis whose light a window receives.
-_LENSLETS_ACROSS = 3
-#: Nodes that are weighted at once.
-_AT_ONCE = 4
-#: Part of a surface, in roundings of its peak, that is not computed.
-_NEGLIGIBLE_SHARE = 0.01
-
-
-class SlopeOperator:
-    """Slopes of surfaces given at a few nodes per lenslet.
-
-    A window receives light of its own lenslet and the eight around it, so each slope is a weighted sum
-    over ``3 x 3`` lenslets of ``NODES x NODES`` nodes.
-
-    ``weights`` are those of :func:`slope_weights`, ``valid (n_sub, n_sub)`` the lenslets with a window.
-    """
-
-    def __init__(
-        self,
-        weights: dict[tuple[int, int], NDArray[np.float64]],
-        valid: NDArray[np.bool_],
-        sub_aperture_m: float,
-    ) -> None:
-        rows, columns = np.nonzero(valid)
-        n_sub, n_valid = len(valid), len(rows)
-        p = next(iter(weights.values())).shape[-1]
-        nodes, interpolation = _lenslet_nodes(p)
-        k, across = nodes.size, n_sub + 2
-        table = np.zeros((n_valid, 2, _LENSLETS_ACROSS, k, _LENSLETS_ACROSS, k))
-        # The same by lenslet: weights on the slopes of the windows that receive its light, and their numbers.
-        by_lenslet = np.zeros((across, across, len(weights), 2, k * k + -k * k % _AT_ONCE))
-        slopes = np.full((across, across, len(weights), 2), -1)
-        for number, ((down, right), block) in enumerate(weights.items()):
-            at_nodes = (interpolation.T @ block @ interpolation).transpose(1, 0, 2, 3)
-            table[:, :, down + 1, :, right + 1, :] = at_nodes
-            at_nodes = at_nodes.reshape(n_valid, 2, -1)
-            by_lenslet[rows + 1 + down, columns + 1 + right, number, :, : k * k] = at_nodes
-            slopes[rows + 1 + down, columns + 1 + right, number] = np.arange(2 * n_valid).reshape(2, -1).T
-        self._table = table.reshape(n_valid, 2, _LENSLETS_ACROSS * k, _LENSLETS_ACROSS * k)
-        self._lenslets = np.argwhere(by_lenslet.any(axis=(2, 3, 4)))
-        at = tuple(self._lenslets.T)
-        self._by_lenslet = by_lenslet[at].reshape(len(self._lenslets), 2 * len(weights), -1)
-        self._slopes_of_lenslet = slopes[at].reshape(len(self._lenslets), -1)
-        # Lenslets beyond the edge have nodes with zero weights.
-        lattice = np.arange(-1, n_sub + 1) - (n_sub - 1) / 2
-        self.nodes_m = ((lattice[:, None] + nodes) * sub_aperture_m).ravel()
-        self._first_y, self._first_x = (rows * k).astype(np.int64), (columns * k).astype(np.int64)
-        self._tables_by_dtype: dict[str, NDArray[np.floating]] = {}
-
-    def slopes(self, surfaces: NDArray[np.floating]) -> NDArray[np.floating]:
-        """Slopes ``(n_slopes, n)`` of surfaces ``(n_nodes, n_nodes, n)`` at the nodes.
-
-        Every node is weighted once per window, which is efficient for a few surfaces.
-        """
-        out = np.zeros((2, len(self._table), surfaces.shape[2]), surfaces.dtype)
-        table = self._cast("windows", self._table, surfaces.dtype)
-        _apply_to_surfaces(table, self._first_y, self._first_x, surfaces, out)
-        return out.reshape(2 * len(self._table), -1)
-
-    def zonal(self, factors: GaussianFactors, *, derivatives: bool = False) -> NDArray[np.floating]:
-        """Slopes of all influence functions ``(n, n_slopes, n_act)``, from their separable factors.
-
-        ``n`` is 1, or 5 with derivatives: the slopes and their derivatives by the position along x and
-        y and by the logarithm of the width along x and y.
-        """
-        kinds = ((0, 0), *DERIVATIVE_KINDS) if derivatives else ((0, 0),)
-        return self.side_by_side([factors.terms(*kind) for kind in kinds])
-
-    def side_by_side(
-        self, sums: Sequence[tuple[NDArray[np.floating], NDArray[np.floating]]]
-    ) -> NDArray[np.floating]:
-        """Slopes ``(n, n_slopes, n_act)`` of sums of equally many products, computed as one."""
-        x, y = (np.concatenate(parts, axis=2) for parts in zip(*sums, strict=True))
-        out = self.sum_of_products(x, y)
-        return np.ascontiguousarray(out.reshape(len(out), len(sums), -1).transpose(1, 0, 2))
-
-    def sum_of_products(self, x: NDArray[np.floating], y: NDArray[np.floating]) -> NDArray[np.floating]:
-        """Slopes ``(n_slopes, n_act)`` of a sum of products of functions of x and of y.
-
-        The functions ``(n_terms, n_nodes, n_act)`` are given at the nodes. The slopes are linear in the
-        surfaces, so the weights are applied once to the sum, and only where it is not negligible.
-        """
-        dtype, n_nodes = x.dtype, self._table.shape[2] // _LENSLETS_ACROSS
-        # Largest values on each row and column of lenslets.
-        peaks = [np.abs(f).reshape(len(f), -1, n_nodes, f.shape[2]).max(axis=2) for f in (x, y)]
-        highest = (peaks[0].max(axis=1) * peaks[1].max(axis=1)).max(axis=0)
-        negligible = _NEGLIGIBLE_SHARE * np.finfo(dtype).eps * highest
-        out = np.zeros((2 * len(self._table), x.shape[2]), dtype)
-        _apply_to_products(
-            self._cast("lenslets", self._by_lenslet, dtype), self._slopes_of_lenslet, self._lenslets,
-            np.ascontiguousarray(x), np.ascontiguousarray(y), *peaks, negligible, out,
-        )  # fmt: skip
-        return out
-
-    def _cast(self, name: str, table: NDArray[np.float64], dtype: DTypeLike) -> NDArray[np.floating]:
-        """A table in a precision, kept by its name."""
-        key = name + np.dtype(dtype).str
-        if key not in self._tables_by_dtype:
-            self._tables_by_dtype[key] = np.ascontiguousarray(table, dtype=np.dtype(dtype))
-        return self._tables_by_dtype[key]
-
-
-def _lenslet_nodes(p: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Nodes ``(k,)`` within a lenslet of unit size, and interpolation ``(p, k)`` to its samples."""
-    samples = (np.arange(p) - (p - 1) / 2) / p
-    if p <= NODES:
-        return samples, np.eye(p)
-    nodes = np.polynomial.legendre.leggauss(NODES)[0] / 2
-    interpolation = np.ones((p, NODES))
-    for j in range(NODES):
-        for i in range(NODES):
-            if i != j:
-                interpolation[:, j] *= (samples - nodes[i]) / (nodes[j] - nodes[i])
-    return nodes, interpolation
-
-
-@njit(cache=True, fastmath=True, nogil=True)
-def _apply_to_surfaces(table, first_y, first_x, surfaces, out):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Weighted sums of surfaces ``(n_y, n_x, n)`` into ``out (2, n_valid, n)``."""
-    size, n = table.shape[2], surfaces.shape[2]
-    for s in range(table.shape[0]):
-        for q in range(size):
-            row = surfaces[first_y[s] + q]
-            for r in range(size):
-                along_x, along_y = table[s, 0, q, r], table[s, 1, q, r]
-                at = row[first_x[s] + r]
-                for m in range(n):
-                    out[0, s, m] += along_x * at[m]
-                    out[1, s, m] += along_y * at[m]
-
-
-@njit(cache=True, fastmath=True, nogil=True)
-def _apply_to_products(  # type: ignore[no-untyped-def]  # pragma: no cover
-    table, slopes, lenslets, x, y, peaks_x, peaks_y, negligible, out
-):
-    """Weighted sums of ``sum_t y_t x_t`` into ``out (n_slopes, n_act)``, one lenslet after another.
-
-    In each, the actuators from the first to the last with a product of peaks above ``negligible (n_act,)``
-    count.
-    """
-    n_terms, _, n_act = x.shape
-    n_slopes, n_nodes = table.shape[1:]
-    k = x.shape[1] // peaks_x.shape[1]
-    surface = np.zeros((n_nodes, n_act), x.dtype)
-    for s in range(len(lenslets)):
-        row, column = lenslets[s]
-        first, last = n_act, 0
-        for t in range(n_terms):
-            for a in range(n_act):
-                if peaks_x[t, column, a] * peaks_y[t, row, a] > negligible[a]:
-                    first, last = min(first, a), max(last, a + 1)
-        if first >= last:
-            continue
-        surface[: k * k, first:last] = 0
-        for t in range(n_terms):
-            for q in range(k):
-                f = y[t, row * k + q, first:last]
-                for r in range(k):
-                    line, g = surface[q * k + r, first:last], x[t, column * k + r, first:last]
-                    for a in range(line.size):
-                        line[a] += f[a] * g[a]
-        # Both slopes of a window, by :data:`_AT_ONCE` nodes: faster than a linear-algebra library.
-        for i in range(0, n_slopes, 2):
-            if slopes[s, i] < 0:
-                continue
-            along_x, along_y = out[slopes[s, i], first:last], out[slopes[s, i + 1], first:last]
-            u, v = table[s, i], table[s, i + 1]
-            for q in range(0, n_nodes, 4):
-                f0, f1 = surface[q, first:last], surface[q + 1, first:last]
-                f2, f3 = surface[q + 2, first:last], surface[q + 3, first:last]
-                u0, u1, u2, u3 = u[q], u[q + 1], u[q + 2], u[q + 3]
-                v0, v1, v2, v3 = v[q], v[q + 1], v[q + 2], v[q + 3]
-                for a in range(along_x.size):
-                    along_x[a] += u0 * f0[a] + u1 * f1[a] + u2 * f2[a] + u3 * f3[a]
-                    along_y[a] += v0 * f0[a] + v1 * f1[a] + v2 * f2[a] + v3 * f3[a]
-
-
 #: Up to this many modes, forming their surfaces is faster than the slopes of all actuators.
 _MAX_DIRECT_MODES = 12
 #: Actuator pitch in lenslets up to which the shapes of pokes within lenslets count
@@ -520,23 +345,6 @@ _MAX_PITCH = 1.5
 _N_POKES = 8
 #: Changes of the registration, in its units, within which the pokes need not be computed again.
 _SAME_POKES_WITHIN = np.array([0.5, 0.5, 0.05, 0.1, 0.1])
-
-
-def _combine(
-    position: NDArray[np.floating], log_width: NDArray[np.floating], parts: NDArray[np.floating]
-) -> NDArray[np.float64]:
-    """Derivatives by the parameters ``(6, n_slopes, n_act)`` from ``parts (4, n_slopes, n_act)``.
-
-    The parts are the derivatives by the positions along x and y and by the logarithms of the widths.
-    """
-    out = np.empty((N_DERIVATIVES, *parts.shape[1:]))
-    for p, ((along_x, along_y), (width_x, width_y)) in enumerate(zip(position, log_width, strict=True)):
-        out[p] = parts[0] * along_x + parts[1] * along_y
-        if width_x:
-            out[p] += parts[2] * width_x
-        if width_y:
-            out[p] += parts[3] * width_y
-    return out
 
 
 def nominal_grid(config: SystemConfig) -> SubApertureGrid:
@@ -551,7 +359,7 @@ def nominal_grid(config: SystemConfig) -> SubApertureGrid:
     return SubApertureGrid(pitch, origin, valid, references, flux.astype(np.float32), 0.0)
 
 
-class ShackHartmannModel(DesignModel):
+class ShackHartmannModel(SummingDesignModel):
     """Small-signal slopes of a diffractive Shack-Hartmann sensor with a mirror of Gaussian actuators.
 
     The centre of gravity of a spot is a smooth function of the phase on its lenslet. Its derivative is
@@ -611,20 +419,8 @@ class ShackHartmannModel(DesignModel):
         if not self._is_separable(registration):
             surfaces = np.moveaxis(self._surfaces(self._slopes.nodes_m, registration, width), 0, 2).copy()
             return np.asarray(self._slopes.slopes(surfaces) * self._opd_per_command_m)
-        factors = self._factors(self._slopes.nodes_m, registration, width, np.float64)
-        return np.asarray(self._slopes.zonal(factors)[0] * self._opd_per_command_m)
-
-    def zonal_sum(
-        self, functions: Sequence[tuple[NDArray[np.float64] | float, Registration, float]]
-    ) -> NDArray[np.float64]:
-        """Slopes of a sum of functions ``(n_slopes, n_act)``, see :class:`SummingModel`; single precision."""
-        x, y = [], []
-        for factor, registration, width in functions:
-            along_x, along_y = self._factors(self._slopes.nodes_m, registration, width).terms(0, 0)
-            x.append(along_x)
-            y.append(along_y * np.asarray(factor, np.float32))
-        total = self._slopes.sum_of_products(np.concatenate(x), np.concatenate(y))
-        return np.asarray(total * self._opd_per_command_m, dtype=float)
+        products = self._factors(registration, width, np.float64).terms(0, 0)
+        return np.asarray(self._slopes.sums_of_products([products])[0] * self._opd_per_command_m)
 
     def zonal_jacobian(
         self, registration: Registration, width: float = 1.0
@@ -634,37 +430,13 @@ class ShackHartmannModel(DesignModel):
             self._slopes.nodes_m, registration, width,
             lambda surfaces: self._slopes.slopes(surfaces) * np.float32(self._opd_per_command_m),
         )  # fmt: skip
-        if measured is not None:
-            return measured
-        factors = self._factors(self._slopes.nodes_m, registration, width, derivatives=True)
-        parts = self._slopes.zonal(factors, derivatives=True)
-        parts *= np.float32(self._opd_per_command_m)
-        return parts[0].astype(float), _combine(factors.position, factors.log_width, parts[1:])
+        return self._gaussian_jacobian(registration, width) if measured is None else measured
 
-    def zonal_components(
-        self, registration: Registration, width: float, functions: Sequence[tuple[float, float]]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Functions of several widths, and derivatives of their sum, see :class:`SummingModel`."""
-        each = [
-            self._factors(self._slopes.nodes_m, registration, width * relative, derivatives=share != 0)
-            for share, relative in functions
-        ]
-        opd = np.float32(self._opd_per_command_m)
-        matrices = np.stack([(self._slopes.zonal(one)[0] * opd).astype(float) for one in each])
-        summed = [
-            (np.float32(share), one) for (share, _), one in zip(functions, each, strict=True) if share != 0
-        ]
-        if not summed:
-            return matrices, np.zeros((N_DERIVATIVES, *matrices.shape[1:]))
-        sums = []
-        for kinds in DERIVATIVE_KINDS:
-            x, y = zip(*(one.terms(*kinds) for _, one in summed), strict=True)
-            weighted = [share * part for (share, _), part in zip(summed, y, strict=True)]
-            sums.append((np.concatenate(x), np.concatenate(weighted)))
-        # The logarithms of all widths change alike.
-        log_width = summed[0][1].log_width.copy()
-        log_width[5] = 1 / width
-        return matrices, _combine(summed[0][1].position, log_width, opd * self._slopes.side_by_side(sums))
+    def _coordinates(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        return self._slopes.nodes_m, self._slopes.nodes_m
+
+    def _slopes_of_sums(self, sums: Sequence[Products]) -> NDArray[np.floating]:
+        return self._slopes.sums_of_products(sums) * np.float32(self._opd_per_command_m)
 
     def modal_matrix(
         self, registration: Registration, m2c: NDArray[np.float64], width: float = 1.0
@@ -672,12 +444,13 @@ class ShackHartmannModel(DesignModel):
         """Slopes per unit mode ``(n_slopes, n_modes)``, see :class:`DifferentiableModel`."""
         if not self._is_separable(registration):
             return self.zonal_matrix(registration, width) @ m2c
-        factors = self._factors(self._slopes.nodes_m, registration, width)
+        factors = self._factors(registration, width)
         if m2c.shape[1] <= _MAX_DIRECT_MODES:
             return np.asarray(
                 self._slopes.slopes(mode_surfaces(factors, m2c)) * self._opd_per_command_m, dtype=float
             )
-        return np.asarray(self._slopes.zonal(factors)[0] @ (m2c * self._opd_per_command_m))
+        zonal = self._slopes.sums_of_products([factors.terms(0, 0)])[0]
+        return np.asarray(zonal @ (m2c * self._opd_per_command_m))
 
     def modal_jacobian(
         self, registration: Registration, m2c: NDArray[np.float64], width: float = 1.0
@@ -686,8 +459,10 @@ class ShackHartmannModel(DesignModel):
         if not isinstance(self._nominal, InfluenceFunctions):
             matrix, derivatives = self.zonal_jacobian(registration, width)
             return matrix @ m2c, derivatives @ m2c
-        factors = self._factors(self._slopes.nodes_m, registration, width, derivatives=True)
-        parts = self._slopes.zonal(factors, derivatives=True)
+        factors = self._factors(registration, width, derivatives=True)
+        parts = self._slopes.sums_of_products(
+            [factors.terms(*kinds) for kinds in MATRIX_AND_DERIVATIVE_KINDS]
+        )
         modes = (m2c * self._opd_per_command_m).astype(np.float32)
         out = np.zeros((N_DERIVATIVES, parts.shape[1], m2c.shape[1]))
         for p in range(N_DERIVATIVES):
