@@ -387,11 +387,14 @@ class PyramidModel(SummingDesignModel):
         )  # fmt: skip
 
     @cached_property
-    def _response(self) -> NDArray[np.float32]:
-        """Derivatives of the slopes by the surface at the nodes; the modal basis needs none."""
+    def _response(self) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
+        """Derivatives of the slopes by the surface at nodes ``(n_slopes, k)``, and these nodes."""
         response = self._slope_response(self._pupils.valid).phase_derivatives
+        # Nodes that are samples are dark beside the pupil.
+        nodes = np.flatnonzero(response.any(axis=0))
+        response = np.ascontiguousarray(response[:, nodes])
         response *= np.float32(self._scale)
-        return response
+        return response, nodes
 
     def _prepare_sensor(self) -> None:
         _ = self._response
@@ -408,7 +411,8 @@ class PyramidModel(SummingDesignModel):
     def _slopes(self, surfaces: NDArray[np.floating]) -> NDArray[np.float64]:
         """Slopes ``(n_slopes, k)`` of surfaces ``(m, m, k)`` at the nodes, in fractions of full stroke."""
         # For few modes reading the response from memory dominates: two threads read one half each.
-        surface_matrix = surfaces.reshape(-1, surfaces.shape[2]).astype(np.float32, copy=False)
-        half = len(self._response) // 2
-        second = self._executor.submit(np.matmul, self._response[half:], surface_matrix)
-        return np.concatenate([self._response[:half] @ surface_matrix, second.result()]).astype(np.float64)
+        response, nodes = self._response
+        surface_matrix = surfaces.reshape(-1, surfaces.shape[2])[nodes].astype(np.float32, copy=False)
+        half = len(response) // 2
+        second = self._executor.submit(np.matmul, response[half:], surface_matrix)
+        return np.concatenate([response[:half] @ surface_matrix, second.result()]).astype(np.float64)
