@@ -26,9 +26,9 @@ def test_the_frames_err_less_than_the_sums_of_a_matrix():
         for k in range(RUNS):
             found = bench.run(docrime_run(bench, frames=FRAMES, record=True))
             matrix, grid, solution = found.result.matrix, found.result.grid, found.solution
-            frames = bench.run(fit_recorded_frames(bench, found.record, matrix, grid, 6)).estimate
-            columns = decorrelate_columns(matrix, solution.gram, solution.variance)
             model = bench.model(grid)
+            frames = bench.run(fit_recorded_frames(bench, found.record, matrix, model, 6)).estimate
+            columns = decorrelate_columns(matrix, solution.gram, solution.variance)
             sums = run(
                 fit_registration(columns, model, covariance=solution.covariance, update_priors=True)
             ).estimate

@@ -19,7 +19,7 @@ from escape_sim.atmosphere.von_karman import structure_function
 from escape_sim.mirror.mode_surfaces import surface_nodes
 from escape_sim.models.factory import make_fast_model
 from escape_sim.models.pyramid import PyramidModel, nominal_pupils
-from escape_sim.models.pyramid_response import slope_response
+from escape_sim.models.pyramid_response import PairCoherence, slope_response
 from escape_sim.models.pyramid_turbulence import (
     estimate_strength,
     fit_registration_change,
@@ -78,6 +78,8 @@ class Bare:
         return power.reshape(self.grid, self.samples, self.grid, self.samples).sum(axis=(1, 3))
 
     def response(self, structure=None, interpolation=None, pairs=None, phase=None):
+        if pairs is not None:
+            pairs = PairCoherence(self.light != 0, self.prism.diameter, self.modulation, pairs)
         return slope_response(
             self.light, self.prism, self.grid * self.samples, self.pupils.corners_px, self.pupils.valid,
             self.modulation, structure, pairs=pairs, interpolation=interpolation, samples=self.samples,

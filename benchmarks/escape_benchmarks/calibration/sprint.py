@@ -30,7 +30,8 @@ from escape_sim.mirror.influence_functions import pitch_on_pupil
 from escape_sim.mirror.mode_surfaces import N_DERIVATIVES, surface_nodes
 from escape_sim.models.factory import make_fast_model
 from escape_sim.models.pyramid import nominal_pupils
-from escape_sim.models.shack_hartmann import NODES, nominal_grid
+from escape_sim.models.shack_hartmann import nominal_grid
+from escape_sim.models.slope_operator import NODES
 from escape_sim.optics.pupil import pupil_geometry
 
 if TYPE_CHECKING:

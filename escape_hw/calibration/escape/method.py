@@ -11,6 +11,7 @@ from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.procedure import Procedure, Reporter
 from escape_hw.api.results import CalibrationResult, RegistrationEstimate
 from escape_hw.api.sensor import SensorGeometry
+from escape_hw.api.synthetic_model import SyntheticModel
 from escape_hw.bench import Bench
 from escape_hw.calibration.acquisition.checkpoint import Checkpoint
 from escape_hw.calibration.acquisition.frames import validate_frame_count
@@ -34,7 +35,7 @@ from escape_hw.calibration.escape.short_runs import (
 from escape_hw.calibration.modes.bases import build_modal_basis
 from escape_hw.calibration.sprint.fit import fit_registration, sprint_options_from_config
 from escape_hw.calibration.sprint.solvers import MATRIX_ONLY_SOLVERS
-from escape_hw.calibration.sprint.synthetic_matrix import synthesise_calibration
+from escape_hw.calibration.sprint.synthetic_matrix import compute_fitted_jacobian, synthesise_calibration
 from escape_hw.calibration.sprint.telemetry_fit import decorrelate_columns
 from escape_hw.config.choices import ESTIMATORS
 from escape_hw.config.system import CalibrationSection
@@ -142,7 +143,8 @@ def _build_criterion(
             return False
         if until.accuracy is None:
             return True
-        estimate = yield from _fit_solution(bench, matrix, grid, solution, from_matrix)
+        model = yield from _build_model(bench, grid)
+        estimate = yield from _fit_solution(bench, matrix, model, solution, from_matrix)
         return estimate.converged and float(estimate.sigma[:2].max()) <= until.accuracy
 
     return criterion
@@ -239,15 +241,18 @@ def _synthesise_from_run(bench: Bench, run: DocrimeRun, from_matrix: bool) -> Pr
     if measured.partial:
         return measured
     try:
+        model = yield from _build_model(bench, measured.grid)
         if run.record is not None and run.record[0].size == measured.frames:
             order = bench.config.calibration.whiten_order
-            fit = yield from fit_recorded_frames(bench, run.record, measured.matrix, measured.grid, order)
+            fit = yield from fit_recorded_frames(bench, run.record, measured.matrix, model, order)
             estimate = fit.estimate
         else:
-            estimate = yield from _fit_solution(bench, measured.matrix, measured.grid, solution, from_matrix)
+            estimate = yield from _fit_solution(bench, measured.matrix, model, solution, from_matrix)
     except Aborted:
         return replace(measured, partial=True)
-    synthetic = synthesise_calibration(bench, measured.grid, estimate, measured.matrix.m2c)
+    m2c = measured.matrix.m2c
+    fitted = compute_fitted_jacobian(model, estimate, m2c)
+    synthetic = synthesise_calibration(bench, measured.grid, estimate, m2c, fitted)
     metrics = {**measured.matrix.metrics, **synthetic.matrix.metrics}
     # The error of the temporal response is common to all modes, so no fit to the matrix contains it.
     gain = estimate.gain
@@ -261,10 +266,16 @@ def _synthesise_from_run(bench: Bench, run: DocrimeRun, from_matrix: bool) -> Pr
     )
 
 
+def _build_model(bench: Bench, grid: SensorGeometry) -> Procedure[SyntheticModel]:
+    """The synthetic model of a run: it takes long on a pyramid."""
+    yield Reporter("synthetic model", 1, "model")(0)
+    return bench.model(grid)
+
+
 def _fit_solution(
     bench: Bench,
     matrix: InteractionMatrix,
-    grid: SensorGeometry,
+    model: SyntheticModel,
     solution: DocrimeSolution,
     from_matrix: bool,
 ) -> Procedure[RegistrationEstimate]:
@@ -274,9 +285,8 @@ def _fit_solution(
     if not from_matrix:
         matrix = decorrelate_columns(matrix, solution.gram, solution.variance)
         modes = matrix.n_modes
-    yield Reporter("synthetic model", 1, "model")(0)
     fit = yield from fit_registration(
-        matrix, bench.model(grid), modes=modes, covariance=solution.covariance, update_priors=True,
+        matrix, model, modes=modes, covariance=solution.covariance, update_priors=True,
         **sprint_options_from_config(c),
     )  # fmt: skip
     return fit.estimate

@@ -14,6 +14,7 @@ from escape_hw.api.interaction_matrix import InteractionMatrix
 from escape_hw.api.procedure import Procedure, Reporter
 from escape_hw.api.results import CalibrationResult
 from escape_hw.api.sensor import SensorGeometry
+from escape_hw.api.synthetic_model import SyntheticModel
 from escape_hw.bench import Bench
 from escape_hw.calibration.acquisition.aligned_telemetry import TelemetryBuffer
 from escape_hw.calibration.acquisition.frames import (
@@ -34,7 +35,7 @@ from escape_hw.calibration.loop.performance import collect_loop_notes
 from escape_hw.calibration.loop.runner import RunningLoop
 from escape_hw.calibration.modes.bases import build_modal_basis
 from escape_hw.calibration.sprint.fit import sprint_options_from_config
-from escape_hw.calibration.sprint.synthetic_matrix import synthesise_calibration
+from escape_hw.calibration.sprint.synthetic_matrix import compute_fitted_jacobian, synthesise_calibration
 from escape_hw.calibration.sprint.telemetry_fit import (
     MIN_WHITENED_FRAMES,
     TelemetryFit,
@@ -89,11 +90,13 @@ def calibrate_short_run(
     )
     shape = (geometry.n_slopes, m2c.shape[1])
     template = build_interaction_matrix(bench, geometry, m2c, np.zeros(shape), np.zeros(shape), "telemetry")
-    fit = yield from fit_recorded_frames(bench, record, template, geometry, order)
+    model = bench.model(geometry)
+    fit = yield from fit_recorded_frames(bench, record, template, model, order)
     n_frames = int(record[0].size)
     result = _build_result(
-        bench, fit, geometry, m2c, frames=n_frames, lost=int(record[0][-1] - record[0][0]) + 1 - n_frames,
-        amplitude=amplitude, poke=poke, order=order, shortened=acquisition.shortened,
+        bench, fit, geometry, model, m2c, frames=n_frames,
+        lost=int(record[0][-1] - record[0][0]) + 1 - n_frames, amplitude=amplitude, poke=poke, order=order,
+        shortened=acquisition.shortened,
     )  # fmt: skip
     return replace(
         result,
@@ -104,17 +107,16 @@ def calibrate_short_run(
 
 
 def fit_recorded_frames(
-    bench: Bench, record: AcquisitionRecord, template: InteractionMatrix, grid: SensorGeometry, order: int
+    bench: Bench, record: AcquisitionRecord, template: InteractionMatrix, model: SyntheticModel, order: int
 ) -> Procedure[TelemetryFit]:
     """Fit the registration to the frames of an open-loop run.
 
-    ``template``, ``grid``: a matrix of this sensor and basis, whose data are not used, and the geometry of
-    the model.
+    ``template``, ``model``: a matrix of this sensor and basis, whose data are not used, and its model.
     """
     c = bench.config.calibration
     data = telemetry_from_frames(*record, before=2 * c.whiten_order + c.lags)
     options = sprint_options_from_config(c)
-    fit = fit_telemetry(data, template, bench.model(grid), order=order, lags=c.lags, options=options)
+    fit = fit_telemetry(data, template, model, order=order, lags=c.lags, options=options)
     return (yield from fit)
 
 
@@ -131,6 +133,7 @@ def _build_result(
     bench: Bench,
     fit: TelemetryFit,
     grid: SensorGeometry,
+    model: SyntheticModel,
     m2c: NDArray[np.float64],
     *,
     frames: int,
@@ -145,7 +148,8 @@ def _build_result(
     ``amplitude``: poke of each mode ``(n_modes,)``; ``poke``: as requested; ``shortened``: number of limited
     commands.
     """
-    synthetic = synthesise_calibration(bench, grid, fit.estimate, m2c)
+    fitted = compute_fitted_jacobian(model, fit.estimate, m2c)
+    synthetic = synthesise_calibration(bench, grid, fit.estimate, m2c, fitted)
     metrics = {
         **synthetic.matrix.metrics, "frames": frames, "lost_frames": lost, "poke": float(amplitude.max()),
         "clipped_pokes": shortened, "delay_frames": fit.response.delay_frames, "whitening_order": order,
@@ -200,13 +204,14 @@ def calibrate_short_run_closed_loop(
     unknown = slice(c.whiten_order + c.lags)
     data.present[unknown], data.slopes[unknown] = False, 0
     registration = closed_loop.registration
+    model = bench.model(geometry)
     fit = yield from fit_telemetry(
-        data, closed_loop.matrix, bench.model(geometry), order=order, lags=c.lags,
+        data, closed_loop.matrix, model, order=order, lags=c.lags,
         options=sprint_options_from_config(c), known_response=closed_loop.response,
         start=None if registration is None else registration.registration,
     )  # fmt: skip
     result = _build_result(
-        bench, fit, geometry, closed_loop.matrix.m2c, frames=frames, lost=buffer.lost,
+        bench, fit, geometry, model, closed_loop.matrix.m2c, frames=frames, lost=buffer.lost,
         amplitude=amplitude, poke=poke, order=order, shortened=loop.record.shortened,
     )  # fmt: skip
     notes = collect_loop_notes(loop.record, bench.wfs.settings.frame_rate_hz)

@@ -7,6 +7,7 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg.blas import dtrmm
 
 from escape_hw.api.synthetic_model import HasSystematicError, SyntheticModel
 from escape_hw.calibration.sprint.weighted_matrix import WeightedMatrix
@@ -127,8 +128,13 @@ def _noise_score_covariance(
     scores: NDArray[np.float64], correlation: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Covariance of the summed scores ``(n, n)`` due to a correlation of the noise of the slopes."""
-    correlated = np.matmul(correlation, scores).reshape(len(scores), -1)
-    return np.asarray(scores.reshape(len(scores), -1) @ correlated.T)
+    # One triangle of a symmetric matrix, with half of the diagonal, gives half of the sum.
+    half = correlation.copy()
+    half[np.diag_indices(len(half))] /= 2
+    by_mode = np.ascontiguousarray(scores.transpose(0, 2, 1)).reshape(-1, len(half))
+    correlated = dtrmm(1.0, half.T, by_mode.T).T
+    covariance = by_mode.reshape(len(scores), -1) @ correlated.reshape(len(scores), -1).T
+    return np.asarray(covariance + covariance.T)
 
 
 def _with_variances(matrix: NDArray[np.float64], variances: NDArray[np.float64]) -> NDArray[np.float64]:

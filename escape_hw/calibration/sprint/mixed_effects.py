@@ -176,6 +176,8 @@ class MixedEffectsProblem:
         self.kept: tuple[_ZonalMatrices, NormalEquations] | None = None
         if earlier and earlier.weighted is weighted:
             self.kept = earlier.kept
+        # The last extrapolated matrix with its state and derivatives: a step is tried before it is taken.
+        self._extrapolated: tuple[MixedEffectsState, _ZonalMatrices, NDArray[np.float64]] | None = None
         self._follow = follow
         self.near: _ZonalMatrices | None = earlier.near if earlier and follow else None
         self.variant_derivatives: VariantDerivatives = (
@@ -357,10 +359,14 @@ class MixedEffectsProblem:
 
     def _extrapolate(self, state: MixedEffectsState, z: _ZonalMatrices) -> NDArray[np.float64]:
         """The weighted matrix of a state, with derivatives from near it ``(n_slopes, n_modes)``."""
+        if self._extrapolated is not None and self._extrapolated[:2] == (state, z):
+            return self._extrapolated[2]
         total = self._extrapolate_zonal(state, z)
         scale = (state.gain * self._slope_gains(state) / self.weighted.by_slope)[:, None]
         modes = (1 + state.actuator_gain)[:, None] * self.modes
-        return np.asarray(scale * (self._sampled(state, total, z) @ modes))
+        model = np.asarray(scale * (self._sampled(state, total, z) @ modes))
+        self._extrapolated = state, z, model
+        return model
 
     def extrapolate_residual(self, state: MixedEffectsState) -> NDArray[np.float64]:
         """The residual about a state, with the derivatives of the last linearisation."""

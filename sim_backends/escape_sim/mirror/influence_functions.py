@@ -35,7 +35,7 @@ def pitch_on_pupil(config: SystemConfig) -> float:
 
 
 #: Square beyond which a Gaussian, 1e-12 there, is zero.
-_NEGLIGIBLE_BEYOND = 55.0
+NEGLIGIBLE_BEYOND = 55.0
 
 
 def gaussian(square: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -44,7 +44,7 @@ def gaussian(square: NDArray[np.float64]) -> NDArray[np.float64]:
     Subnormal numbers, of which products of two such factors would be full in single precision, make matrix
     products up to sixty times slower on some processors.
     """
-    return np.where(square < _NEGLIGIBLE_BEYOND, np.exp(-0.5 * square), 0.0)
+    return np.where(square < NEGLIGIBLE_BEYOND, np.exp(-0.5 * square), 0.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -5,13 +5,20 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from numpy.typing import DTypeLike, NDArray
 
 from escape_hw.api.registration import Registration
-from escape_sim.mirror.influence_functions import InfluenceFunctions, gaussian
+from escape_sim.mirror.influence_functions import NEGLIGIBLE_BEYOND, InfluenceFunctions
 
 #: Derivatives by the five parameters of the registration, in their order, and by the width.
 N_DERIVATIVES = 6
+#: Kinds of the factors along x and y in the derivatives by the positions and by the logarithms of the widths.
+DERIVATIVE_KINDS = ((1, 0), (0, 1), (2, 0), (0, 2))
+#: The same after those of the matrix itself.
+MATRIX_AND_DERIVATIVE_KINDS = ((0, 0), *DERIVATIVE_KINDS)
+#: Functions of x ``(n_terms, n_x, n_act)`` and of y ``(n_terms, n_y, n_act)``, whose products are summed.
+Products = tuple[NDArray[np.floating], NDArray[np.floating]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,11 +44,13 @@ class GaussianFactors:
         """Number of Gaussians of the profile."""
         return int(self.along_x.shape[2] // self.position.shape[2])
 
-    def sum_terms(self, values: NDArray[np.floating]) -> NDArray[np.floating]:
-        """Sums over the Gaussians ``(..., n_act)`` of values ``(..., n_terms * n_act)``."""
-        if self.n_terms == 1:
-            return values
-        return np.asarray(values.reshape(*values.shape[:-1], self.n_terms, -1).sum(axis=-2))
+    def terms(self, kind_x: int, kind_y: int) -> Products:
+        """Factors of two kinds, one product per Gaussian."""
+        x, y = (
+            f.reshape(len(f), self.n_terms, -1).transpose(1, 0, 2)
+            for f in (self.along_x[kind_x], self.along_y[kind_y])
+        )
+        return x, y
 
     def commands(self, m2c: NDArray[np.floating]) -> NDArray[np.floating]:
         """Commands of all Gaussians ``(n_terms * n_act, n_modes)`` for ``m2c (n_act, n_modes)``."""
@@ -82,20 +91,31 @@ def gaussian_factors(
         float(influence.width) * influence.pitch_m / np.sqrt(2 * np.log(1 / influence.coupling))
     )
     stretch = 1 + np.array([registration.radial_scaling, registration.tangential_scaling]) / 100
-    factors_xy = []
-    for coordinates, position, s in (
-        (x_m, at[:, 0], sigma * stretch[0]),
-        (y_m, at[:, 1], sigma * stretch[1]),
-    ):
-        u = (coordinates[:, None] - position) / s
-        gauss = gaussian(np.square(u))
-        kinds = [gauss, gauss * u / s, gauss * np.square(u)] if derivatives else [gauss]
-        factors_xy.append(np.stack(kinds))
-    factors_xy[1] *= float(influence.gain) * shares
-    position, log_width = _parameter_derivatives(influence, registration, sub_aperture_m, stretch)
-    return GaussianFactors(
-        factors_xy[0].astype(dtype), factors_xy[1].astype(dtype), position.astype(dtype), log_width
-    )
+    n_kinds = 3 if derivatives else 1
+    along_x, along_y = (np.empty((n_kinds, len(at_m), len(at)), dtype) for at_m in (x_m, y_m))
+    _fill_factors(x_m, at[:, 0], sigma * stretch[0], np.ones(len(at)), along_x)
+    _fill_factors(y_m, at[:, 1], sigma * stretch[1], float(influence.gain) * shares, along_y)
+    position, log_width = np.zeros((N_DERIVATIVES, 2, influence.n_act)), np.zeros((N_DERIVATIVES, 2))
+    if derivatives:
+        position, log_width = _parameter_derivatives(influence, registration, sub_aperture_m, stretch)
+    return GaussianFactors(along_x, along_y, position.astype(dtype), log_width)
+
+
+@njit(cache=True, nogil=True)
+def _fill_factors(coordinates, positions, sigma, factor, out):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """``factor X_0``, and with three kinds ``factor X_1`` and ``factor X_2``, into ``out (kinds, n, n_act)``.
+
+    Zero far out, as :func:`~.influence_functions.gaussian` is.
+    """
+    out[:] = 0
+    for i in range(coordinates.size):
+        for a in range(positions.size):
+            u = (coordinates[i] - positions[a]) / sigma[a]
+            if u * u < NEGLIGIBLE_BEYOND:
+                gauss = factor[a] * np.exp(-0.5 * u * u)
+                out[0, i, a] = gauss
+                if len(out) > 1:
+                    out[1, i, a], out[2, i, a] = gauss * u / sigma[a], gauss * u * u
 
 
 def _parameter_derivatives(
@@ -118,6 +138,23 @@ def _parameter_derivatives(
     log_width[3, 0], log_width[4, 1] = 0.01 / stretch
     log_width[5] = 1 / float(influence.width)
     return position, log_width
+
+
+def combine_derivatives(
+    position: NDArray[np.floating], log_width: NDArray[np.floating], parts: NDArray[np.floating]
+) -> NDArray[np.float64]:
+    """Derivatives by the parameters ``(6, n_slopes, n_act)`` from ``parts (4, n_slopes, n_act)``.
+
+    The parts are the derivatives by the positions along x and y and by the logarithms of the widths.
+    """
+    out = np.empty((N_DERIVATIVES, *parts.shape[1:]))
+    for p, ((along_x, along_y), (width_x, width_y)) in enumerate(zip(position, log_width, strict=True)):
+        out[p] = parts[0] * along_x + parts[1] * along_y
+        if width_x:
+            out[p] += parts[2] * width_x
+        if width_y:
+            out[p] += parts[3] * width_y
+    return out
 
 
 def mode_surfaces(factors: GaussianFactors, m2c: NDArray[np.floating]) -> NDArray[np.floating]:

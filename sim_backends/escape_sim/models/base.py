@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import abc
 import copy
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Self
 
 import numpy as np
@@ -13,7 +14,15 @@ from escape_hw.api.flips import Flip
 from escape_hw.api.registration import Registration
 from escape_hw.api.synthetic_model import PROFILE_WIDTHS
 from escape_sim.mirror.influence_functions import InfluenceFunctions
-from escape_sim.mirror.mode_surfaces import GaussianFactors, gaussian_factors
+from escape_sim.mirror.mode_surfaces import (
+    DERIVATIVE_KINDS,
+    MATRIX_AND_DERIVATIVE_KINDS,
+    N_DERIVATIVES,
+    GaussianFactors,
+    Products,
+    combine_derivatives,
+    gaussian_factors,
+)
 from escape_sim.mirror.nominal import gaussian_functions, nominal_influence_functions
 from escape_sim.optics.pupil import PupilGeometry
 
@@ -56,9 +65,13 @@ class DesignModel:
 
     def component_model(self) -> Self:
         """The same model with a single Gaussian, see :class:`HasProfile`."""
+        self._prepare_sensor()
         single = copy.copy(self)
         single._nominal = self._gaussian  # noqa: SLF001
         return single
+
+    def _prepare_sensor(self) -> None:
+        """Compute what models of other mirrors on this sensor share and what is computed on first use."""
 
     @property
     def sub_aperture_m(self) -> float:
@@ -94,23 +107,6 @@ class DesignModel:
         influence = self._nominal.with_width(width)
         return influence.surfaces(registration or Registration(), self.sub_aperture_m, at_m, at_m)
 
-    def _factors(
-        self,
-        at_m: NDArray[np.float64],
-        registration: Registration,
-        width: float,
-        dtype: DTypeLike = np.float32,
-        *,
-        derivatives: bool = False,
-    ) -> GaussianFactors:
-        """Factors of Gaussian influence functions (ValueError: the nominal ones are on a grid)."""
-        if not isinstance(self._nominal, InfluenceFunctions):
-            raise ValueError("influence functions on a grid have no factors")
-        influence = self._nominal.with_width(width)
-        return gaussian_factors(
-            influence, registration, self.sub_aperture_m, at_m, at_m, dtype, derivatives=derivatives
-        )
-
     def _measured_jacobian(
         self,
         at_m: NDArray[np.float64],
@@ -137,10 +133,86 @@ class DesignModel:
         return joined[0], joined[1:]
 
 
-class SurfaceModel(DesignModel):
+class SummingDesignModel(DesignModel, abc.ABC):
+    """A model whose slopes are linear in surfaces at nodes, see :class:`SummingModel`."""
+
+    _precision: DTypeLike = np.float32
+
+    @abc.abstractmethod
+    def _coordinates(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Coordinates of the nodes along x and along y in metres."""
+
+    @abc.abstractmethod
+    def _slopes_of_sums(self, sums: Sequence[Products]) -> NDArray[np.floating]:
+        """Slopes per unit command ``(n, n_slopes, n_act)`` of sums of equally many products at the nodes."""
+
+    def _factors(
+        self,
+        registration: Registration,
+        width: float,
+        dtype: DTypeLike | None = None,
+        *,
+        derivatives: bool = False,
+    ) -> GaussianFactors:
+        """Factors of Gaussian influence functions (ValueError: the nominal ones are on a grid)."""
+        if not isinstance(self._nominal, InfluenceFunctions):
+            raise ValueError("influence functions on a grid have no factors")
+        return gaussian_factors(
+            self._nominal.with_width(width), registration, self.sub_aperture_m, *self._coordinates(),
+            dtype or self._precision, derivatives=derivatives,
+        )  # fmt: skip
+
+    def zonal_sum(
+        self, functions: Sequence[tuple[NDArray[np.float64] | float, Registration, float]]
+    ) -> NDArray[np.float64]:
+        """Slopes of a sum of influence functions ``(n_slopes, n_act)``, see :class:`SummingModel`."""
+        x, y = zip(
+            *(self._factors(registration, width).terms(0, 0) for _, registration, width in functions),
+            strict=True,
+        )
+        weighted = [
+            part * np.asarray(factor, part.dtype) for (factor, _, _), part in zip(functions, y, strict=True)
+        ]
+        slopes = self._slopes_of_sums([(np.concatenate(x), np.concatenate(weighted))])
+        return np.asarray(slopes[0], dtype=float)
+
+    def zonal_components(
+        self, registration: Registration, width: float, functions: Sequence[tuple[float, float]]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Functions of several widths, and derivatives of their sum, see :class:`SummingModel`."""
+        each = [
+            self._factors(registration, width * relative, derivatives=share != 0)
+            for share, relative in functions
+        ]
+        matrices = np.concatenate([self._slopes_of_sums([one.terms(0, 0)]) for one in each]).astype(float)
+        summed = [(share, one) for (share, _), one in zip(functions, each, strict=True) if share != 0]
+        if not summed:
+            return matrices, np.zeros((N_DERIVATIVES, *matrices.shape[1:]))
+        # The slopes are linear in the surfaces, so only those of the sum are computed.
+        sums = []
+        for kinds in DERIVATIVE_KINDS:
+            x, y = zip(*(one.terms(*kinds) for _, one in summed), strict=True)
+            weighted = [part * part.dtype.type(share) for (share, _), part in zip(summed, y, strict=True)]
+            sums.append((np.concatenate(x), np.concatenate(weighted)))
+        # The logarithms of all widths change alike.
+        position, log_width = summed[0][1].position, summed[0][1].log_width.copy()
+        log_width[5] = 1 / width
+        return matrices, combine_derivatives(position, log_width, self._slopes_of_sums(sums))
+
+    def _gaussian_jacobian(
+        self, registration: Registration, width: float
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Zonal matrix of Gaussian influence functions and its derivatives."""
+        factors = self._factors(registration, width, derivatives=True)
+        parts = self._slopes_of_sums([factors.terms(*kinds) for kinds in MATRIX_AND_DERIVATIVE_KINDS])
+        return parts[0].astype(float), combine_derivatives(factors.position, factors.log_width, parts[1:])
+
+
+class SurfaceModel(SummingDesignModel):
     """The design's mirror on a sensor of heights: its slopes are those of the grid points, row by row."""
 
     name = "surface"
+    _precision = np.float64
 
     def __init__(
         self,
@@ -157,6 +229,12 @@ class SurfaceModel(DesignModel):
         influence = self._nominal.with_width(width)
         surfaces = influence.surfaces(registration, self.sub_aperture_m, self._x_m, self._y_m)
         return surfaces.reshape(len(surfaces), -1).T
+
+    def _coordinates(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        return self._x_m, self._y_m
+
+    def _slopes_of_sums(self, sums: Sequence[Products]) -> NDArray[np.floating]:
+        return np.stack([np.einsum("tya,txa->yxa", y, x).reshape(-1, x.shape[2]) for x, y in sums])
 
     def variants(self) -> list[Self]:
         """No variants: heights do not depend on the sensor."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,14 +18,14 @@ from escape_hw.config.sensor import PyramidSection
 from escape_sim.mirror.influence_functions import SINGLE_GAUSSIAN, InfluenceFunctions
 from escape_sim.mirror.mode_surfaces import (
     N_DERIVATIVES,
-    GaussianFactors,
+    Products,
     mode_derivatives,
     mode_surfaces,
     surface_nodes,
 )
-from escape_sim.models.base import DesignModel
+from escape_sim.models.base import SummingDesignModel
 from escape_sim.models.pyramid_mean_phase import coarse_pixels, estimate_mean_phase, low_order_phases
-from escape_sim.models.pyramid_response import SlopeResponse, slope_response
+from escape_sim.models.pyramid_response import PairCoherence, SlopeResponse, slope_response
 from escape_sim.models.pyramid_turbulence import (
     PokePhase,
     Turbulence,
@@ -63,9 +64,6 @@ _N_SHAPES = 60
 #: whose sum is used or whose difference does not depend on the phase.
 _DIAGONALS = np.array([1.0, -1.0, -1.0, 1.0])
 
-#: Kinds of the factors along x and y in the derivatives by the positions and by the logarithms of the widths.
-_DERIVATIVE_KINDS = ((1, 0), (0, 1), (2, 0), (0, 2))
-
 
 def nominal_pupils(config: SystemConfig) -> PyramidPupils:
     """The design's pupil images; valid where the design flux is sufficient."""
@@ -79,15 +77,7 @@ def nominal_pupils(config: SystemConfig) -> PyramidPupils:
     )  # fmt: skip
 
 
-def _zonal_surfaces(factors: GaussianFactors, kind_x: int, kind_y: int) -> NDArray[np.floating]:
-    """Products ``(n_y, n_x, n_act)`` of two factors, summed over the Gaussians of the profile."""
-    x, y = (
-        f.reshape(len(f), factors.n_terms, -1) for f in (factors.along_x[kind_x], factors.along_y[kind_y])
-    )
-    return np.asarray(np.einsum("yka,xka->yxa", y, x))
-
-
-class PyramidModel(DesignModel):
+class PyramidModel(SummingDesignModel):
     """Small-signal slopes of a modulated pyramid with a mirror of Gaussian actuators.
 
     The derivatives of the slopes by the phase are computed once, at a flat wavefront or averaged over
@@ -135,8 +125,9 @@ class PyramidModel(DesignModel):
         self._pupils, self._modes = pupils, basis
         self._modulation = modulation or ModulationPath.circle(pupils.modulation)
         # The optical path changes by twice the surface.
-        scale = 2 * config.devices.dm.stroke_m * 2 * np.pi / config.system.wavelength_m
-        self._pokes = self._measured_pokes(scale) if pupils.pokes else None
+        self._scale = 2 * config.devices.dm.stroke_m * 2 * np.pi / config.system.wavelength_m
+        self._pokes = self._measured_pokes() if pupils.pokes else None
+        self._coherence: PairCoherence | None = None
         self._phases = phases or self._build_turbulence()
         if turbulence is None:
             turbulence = estimate_strength(self.optics(), pupils, self._phases.phases(1.0), self._pokes)
@@ -153,8 +144,6 @@ class PyramidModel(DesignModel):
         self.mean_phase = mean_phase
         if mean_phase is None and self.turbulence and pupils.mean_low_orders is not None:
             self.mean_phase = self._estimate_mean_phase()
-        self._response = self._slope_response(pupils.valid).phase_derivatives
-        self._response *= np.float32(scale)
         self._executor = ThreadPoolExecutor(1, "pyramid-model")
         self._variants: list[PyramidModel] | None = None
         self._shifted_models: dict[tuple[float, float], PyramidModel] = {}
@@ -192,18 +181,8 @@ class PyramidModel(DesignModel):
         """Slopes per unit command ``(n_slopes, n_act)``, see :class:`SyntheticModel`; single precision."""
         if not self._is_separable(registration):
             return self._slopes(np.moveaxis(self._surfaces(self._nodes, registration, width), 0, 2))
-        factors = self._factors(self._nodes, registration, width)
-        return self._slopes(_zonal_surfaces(factors, 0, 0))
-
-    def zonal_sum(
-        self, functions: Sequence[tuple[NDArray[np.float64] | float, Registration, float]]
-    ) -> NDArray[np.float64]:
-        """Slopes of a sum of influence functions ``(n_slopes, n_act)``, see :class:`SummingModel`."""
-        surfaces = np.zeros((self._nodes.size, self._nodes.size, self.n_act), np.float32)
-        for factor, registration, width in functions:
-            factors = self._factors(self._nodes, registration, width)
-            surfaces += _zonal_surfaces(factors, 0, 0) * np.asarray(factor, np.float32)
-        return self._slopes(surfaces)
+        products = self._factors(registration, width).terms(0, 0)
+        return np.asarray(self._slopes_of_sums([products])[0])
 
     def modal_matrix(
         self, registration: Registration, m2c: NDArray[np.float64], width: float = 1.0
@@ -211,7 +190,7 @@ class PyramidModel(DesignModel):
         """Slopes per unit mode ``(n_slopes, n_modes)``, see :class:`DifferentiableModel`."""
         if not self._is_separable(registration):
             return self.zonal_matrix(registration, width) @ m2c
-        return self._slopes(mode_surfaces(self._factors(self._nodes, registration, width), m2c))
+        return self._slopes(mode_surfaces(self._factors(registration, width), m2c))
 
     def modal_jacobian(
         self, registration: Registration, m2c: NDArray[np.float64], width: float = 1.0
@@ -220,7 +199,7 @@ class PyramidModel(DesignModel):
         if not isinstance(self._nominal, InfluenceFunctions):
             matrix, derivatives = self.zonal_jacobian(registration, width)
             return matrix @ m2c, derivatives @ m2c
-        surfaces = mode_derivatives(self._factors(self._nodes, registration, width, derivatives=True), m2c)
+        surfaces = mode_derivatives(self._factors(registration, width, derivatives=True), m2c)
         parts = self._slopes(surfaces.reshape(*surfaces.shape[:2], -1))
         parts = parts.reshape(-1, 1 + N_DERIVATIVES, m2c.shape[1]).transpose(1, 0, 2)
         return parts[0], parts[1:]
@@ -230,47 +209,7 @@ class PyramidModel(DesignModel):
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Zonal matrix and its derivatives, see :class:`DifferentiableModel`."""
         measured = self._measured_jacobian(self._nodes, registration, width, self._slopes)
-        if measured is not None:
-            return measured
-        factors = self._factors(self._nodes, registration, width, derivatives=True)
-        matrix = self._slopes(_zonal_surfaces(factors, 0, 0))
-        parts = [self._slopes(_zonal_surfaces(factors, *kinds)) for kinds in _DERIVATIVE_KINDS]
-        return matrix, self._combine(factors, parts)
-
-    def zonal_components(
-        self, registration: Registration, width: float, functions: Sequence[tuple[float, float]]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Functions of several widths, and derivatives of their sum, see :class:`SummingModel`."""
-        each = [
-            self._factors(self._nodes, registration, width * relative, derivatives=share != 0)
-            for share, relative in functions
-        ]
-        matrices = np.stack([self._slopes(_zonal_surfaces(factors, 0, 0)) for factors in each])
-        summed = [
-            (np.float32(share), factors)
-            for (share, _), factors in zip(functions, each, strict=True)
-            if share != 0
-        ]
-        if not summed:
-            return matrices, np.zeros((N_DERIVATIVES, *matrices.shape[1:]))
-        parts = []
-        # The slopes are linear in the surfaces, so only those of the sum are computed.
-        for kinds in _DERIVATIVE_KINDS:
-            surfaces = np.zeros((self._nodes.size, self._nodes.size, self.n_act), np.float32)
-            for factor, factors in summed:
-                surfaces += factor * _zonal_surfaces(factors, *kinds)
-            parts.append(self._slopes(surfaces))
-        # The logarithms of all widths change alike.
-        log_width = summed[0][1].log_width.copy()
-        log_width[5] = 1 / width
-        return matrices, self._combine(replace(summed[0][1], log_width=log_width), parts)
-
-    def _combine(self, factors: GaussianFactors, parts: list[NDArray[np.float64]]) -> NDArray[np.float64]:
-        """Derivatives by the parameters from those by positions and by logarithms of the widths."""
-        derivatives = np.concatenate(
-            [factors.position, np.repeat(factors.log_width[:, :, None], self.n_act, 2)], axis=1
-        )
-        return np.asarray(np.einsum("pka,ksa->psa", derivatives, np.stack(parts), optimize=True))
+        return self._gaussian_jacobian(registration, width) if measured is None else measured
 
     def with_pupil_shift(self, shift_x: float, shift_y: float) -> PyramidModel:
         """The model with shifted images under the same turbulence, see :class:`HasPupilShift`."""
@@ -325,11 +264,16 @@ class PyramidModel(DesignModel):
         turbulence: float | None = None,
     ) -> PyramidModel:
         """The same model, except for what is given."""
-        return PyramidModel(
+        varied = PyramidModel(
             self._config, pupils or self._pupils, modulation=modulation or self._modulation,
             turbulence=self.turbulence if turbulence is None else turbulence, basis=self._modes,
             phases=self._phases, mean_phase=self.mean_phase,
         )  # fmt: skip
+        same_pupil = np.array_equal(varied._pupil.amplitude != 0, self._pupil.amplitude != 0)
+        if modulation is None and turbulence is None and same_pupil:
+            # Displaced images see the same wavefronts.
+            varied._coherence = self._pair_coherence()
+        return varied
 
     def _strength_uncertainty(self) -> NDArray[np.float64]:
         """Registration error ``(5,)`` by the strength of the turbulence, where it is not fitted."""
@@ -380,14 +324,14 @@ class PyramidModel(DesignModel):
         distances = sample_distances(len(pupil.coordinates_m), pupil.pixel_m) / self._config.system.pupil_m
         return Turbulence(_OUTER_SCALE, distances, pupil.lit, modes)
 
-    def _measured_pokes(self, scale: float) -> PokePhase:
-        """Pokes of the measured rms; ``scale`` converts full stroke of surface to radians of phase."""
+    def _measured_pokes(self) -> PokePhase:
+        """Pokes of the measured rms."""
         m2c = self._basis()
         surfaces, lit, _ = self.influence_functions()
         # Pokes are uniformly distributed, with an rms of 1 / sqrt(3) of their maximum.
         max_amplitude = self._config.calibration.poke_command / np.abs(m2c).max(axis=0) / np.sqrt(3)
         return PokePhase.from_rms(
-            self._pupils.pokes, max_amplitude, scale * np.tensordot(m2c.T, surfaces, 1), lit
+            self._pupils.pokes, max_amplitude, self._scale * np.tensordot(m2c.T, surfaces, 1), lit
         )
 
     def _slope_response(self, pixels: NDArray[np.bool_]) -> SlopeResponse:
@@ -397,7 +341,7 @@ class PyramidModel(DesignModel):
         shape = self._config.devices.wfs.region[:1:-1]
         grid = next_fast_length(max(shape), samples)
         region = GridRegion(pupils.centres_px, shape, grid, samples)
-        structure, pairs = None, self._pair_structure()
+        structure, pairs = None, self._pair_coherence()
         if pairs is None and self.turbulence:
             structure = self._phases.structure(self.turbulence)
         return slope_response(
@@ -414,6 +358,13 @@ class PyramidModel(DesignModel):
             self._slope_response(pixels), pixels, self._pupils, self._nodes / radius_m,
             self._pupil.coordinates_m / radius_m,
         )  # fmt: skip
+
+    def _pair_coherence(self) -> PairCoherence | None:
+        """Coherence of all pairs of lit samples, kept; ``None`` where the phase is stationary."""
+        if self._coherence is None and (structure := self._pair_structure()) is not None:
+            diameter = float(self._pupil.n_sub * self._pupil.n_pix)
+            self._coherence = PairCoherence(self._pupil.amplitude != 0, diameter, self._modulation, structure)
+        return self._coherence
 
     def _pair_structure(self) -> NDArray[np.float32] | None:
         """Structure function of all pairs of lit samples; ``None`` where the phase is stationary.
@@ -435,11 +386,33 @@ class PyramidModel(DesignModel):
             samples=self._pupil.n_pix,
         )  # fmt: skip
 
+    @cached_property
+    def _response(self) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
+        """Derivatives of the slopes by the surface at nodes ``(n_slopes, k)``, and these nodes."""
+        response = self._slope_response(self._pupils.valid).phase_derivatives
+        # Nodes that are samples are dark beside the pupil.
+        nodes = np.flatnonzero(response.any(axis=0))
+        response = np.ascontiguousarray(response[:, nodes])
+        response *= np.float32(self._scale)
+        return response, nodes
+
+    def _prepare_sensor(self) -> None:
+        _ = self._response
+
     # ------------------------------------------------------------------ mirror
+    def _coordinates(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        return self._nodes, self._nodes
+
+    def _slopes_of_sums(self, sums: Sequence[Products]) -> NDArray[np.floating]:
+        surfaces = [np.einsum("tya,txa->yxa", y, x) for x, y in sums]
+        slopes = self._slopes(np.concatenate(surfaces, axis=2))
+        return slopes.reshape(len(slopes), len(sums), -1).transpose(1, 0, 2)
+
     def _slopes(self, surfaces: NDArray[np.floating]) -> NDArray[np.float64]:
         """Slopes ``(n_slopes, k)`` of surfaces ``(m, m, k)`` at the nodes, in fractions of full stroke."""
         # For few modes reading the response from memory dominates: two threads read one half each.
-        surface_matrix = surfaces.reshape(-1, surfaces.shape[2]).astype(np.float32, copy=False)
-        half = len(self._response) // 2
-        second = self._executor.submit(np.matmul, self._response[half:], surface_matrix)
-        return np.concatenate([self._response[:half] @ surface_matrix, second.result()]).astype(np.float64)
+        response, nodes = self._response
+        surface_matrix = surfaces.reshape(-1, surfaces.shape[2])[nodes].astype(np.float32, copy=False)
+        half = len(response) // 2
+        second = self._executor.submit(np.matmul, response[half:], surface_matrix)
+        return np.concatenate([response[:half] @ surface_matrix, second.result()]).astype(np.float64)

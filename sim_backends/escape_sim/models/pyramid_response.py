@@ -79,25 +79,33 @@ class TurbulentCorrelations:
             yield filter_.result
 
 
-class PairwiseCorrelations:
-    """Correlations of a modulation under phases that are not stationary: products with all pairs' coherence.
+class PairCoherence:
+    """Mean of ``exp(i (phi(p) - phi(q)))`` of all pairs of lit samples, for phases that are not stationary.
 
-    ``light`` and ``kernel`` are as for :class:`TurbulentCorrelations`, ``structure`` is the structure
-    function of all pairs of lit samples ``(k, k)`` in rad^2, rows of the pupil one after another.
+    Where the pupil and the phases are symmetric about the centre, even and odd fields do not mix. They are
+    multiplied by themselves, which is half of the work.
+
+    Parameters
+    ----------
+    lit
+        Lit samples ``(n, n)``; pairs are in the order of their rows.
+    diameter
+        Samples across the pupil.
+    modulation
+        Path of the image over the pyramid.
+    structure
+        Structure function of the phases ``(k, k)`` in rad^2.
     """
 
     def __init__(
         self,
-        light: _Light,
-        kernel: NDArray[np.complex64],
+        lit: NDArray[np.bool_],
         diameter: float,
         modulation: ModulationPath,
         structure: NDArray[np.float32],
     ) -> None:
-        lit = light != 0
-        self._kernel, self._lit = kernel, lit
-        self._rows, self._columns = np.nonzero(lit)
-        at = np.stack([self._columns, self._rows], axis=1) * (2 * np.pi / diameter)
+        self.rows, self.columns = np.nonzero(lit)
+        at = np.stack([self.columns, self.rows], axis=1) * (2 * np.pi / diameter)
         tilts = np.exp(1j * at @ modulation.points.T) * np.sqrt(modulation.weight)
         coherence = tilts.conj() @ tilts.T
         # A circle or an ellipse is symmetric, and its coherence real.
@@ -105,21 +113,48 @@ class PairwiseCorrelations:
             coherence = coherence.real
         single = np.float32 if np.isrealobj(coherence) else np.complex64
         # Characteristic function of a Gaussian phase.
-        self._coherence = coherence.astype(single) * np.exp(np.float32(-0.5) * structure)
-        self._light = light[lit].conj()
+        coherence = coherence.astype(single) * np.exp(np.float32(-0.5) * structure)
+        self._parts: tuple[NDArray[np.floating | np.complexfloating], ...] = (coherence,)
+        half, odd = divmod(len(coherence), 2)
+        is_symmetric = not odd and np.array_equal(lit, lit[::-1, ::-1])
+        if is_symmetric and np.abs(coherence - coherence[::-1, ::-1]).max() < _ROUNDING:
+            within, across = coherence[:half, :half], coherence[:half, : half - 1 : -1]
+            self._parts = (within + across) / 2, (within - across) / 2
+
+    def products(self, fields: NDArray[np.complex64]) -> NDArray[np.complex64]:
+        """Products of fields ``(count, k)`` with the coherence ``(k, k)``."""
+        if not np.isrealobj(self._parts[0]):
+            return np.asarray(fields @ self._parts[0])
+        count = len(fields)
+        parts = np.concatenate([fields.real, fields.imag])
+        if len(self._parts) == 1:
+            parts = parts @ self._parts[0]
+        else:
+            half = parts.shape[1] // 2
+            first, second = parts[:, :half], parts[:, : half - 1 : -1]
+            even, odd = (first + second) @ self._parts[0], (first - second) @ self._parts[1]
+            parts = np.concatenate([even + odd, (even - odd)[:, ::-1]], axis=1)
+        return np.asarray(parts[:count] + 1j * parts[count:])
+
+
+class PairwiseCorrelations:
+    """Correlations of a modulation under phases that are not stationary: products with all pairs' coherence.
+
+    ``light`` and ``kernel`` are as for :class:`TurbulentCorrelations`, ``pairs`` is the coherence of the lit
+    samples.
+    """
+
+    def __init__(self, light: _Light, kernel: NDArray[np.complex64], pairs: PairCoherence) -> None:
+        self._kernel, self._lit, self._pairs = kernel, light != 0, pairs
+        self._light = light[self._lit].conj()
 
     def correlations(self, pixels: NDArray[np.intp]) -> Iterator[NDArray[np.complex64]]:
         """Yield ``n`` rows of ``n`` samples for each (row, column) ``u`` in ``pixels``."""
-        n, count = len(self._lit), len(pixels)
+        n = len(self._lit)
         at = pixels[:, :, None] + (n - 1)
-        fields = self._kernel[at[:, 0] - self._rows, at[:, 1] - self._columns].conj() * self._light
-        if np.isrealobj(self._coherence):
-            parts = np.concatenate([fields.real, fields.imag]) @ self._coherence
-            products = parts[:count] + 1j * parts[count:]
-        else:
-            products = fields @ self._coherence
+        fields = self._kernel[at[:, 0] - self._pairs.rows, at[:, 1] - self._pairs.columns].conj()
         result = np.zeros((n, n), np.complex64)
-        for product in products:
+        for product in self._pairs.products(fields * self._light):
             result[self._lit] = product
             yield result
 
@@ -153,8 +188,8 @@ _Correlations = ModulatedCorrelations | TurbulentCorrelations | PairwiseCorrelat
 _WORKERS = 2
 #: Camera pixels whose correlations are computed together: enough for an efficient matrix product.
 _BLOCK = 16
-#: Imaginary part of a coherence that is due to rounding.
-_NEGLIGIBLE_PART = 1e-9
+#: Imaginary part of a coherence that is due to rounding; the same of its asymmetry in single precision.
+_NEGLIGIBLE_PART, _ROUNDING = 1e-9, 1e-4
 #: Sign of each image in the x and the y slope: upper left, upper right, lower left, lower right.
 _SIGNS = np.array([[-1, -1], [1, -1], [-1, 1], [1, 1]], np.float32)
 
@@ -201,7 +236,7 @@ def slope_response(
     modulation: ModulationPath,
     structure: NDArray[np.float64] | None = None,
     *,
-    pairs: NDArray[np.float32] | None = None,
+    pairs: PairCoherence | None = None,
     interpolation: NDArray[np.float32] | None = None,
     samples: int = 1,
     local: bool = False,
@@ -232,8 +267,8 @@ def slope_response(
         Structure function ``(2 n - 1, 2 n - 1)`` in rad^2 of the turbulence to average over, at
         distances from ``-(n - 1)`` to ``n - 1`` samples along y and x; none by default.
     pairs
-        Structure function of all pairs of lit samples ``(k, k)`` in rad^2, for phases that are not
-        stationary; in place of ``structure``.
+        Coherence of the lit samples under phases that are not stationary; in place of ``structure``, and
+        with ``modulation`` applied.
     interpolation
         Matrix ``(n, m)`` from the phase at nodes to the phase at samples, along either axis; by
         default the nodes are the samples.
@@ -258,7 +293,7 @@ def slope_response(
     kernel = _prism_kernel(prism, len(light), n_grid)
     correlations: Sequence[_Correlations]
     if pairs is not None:
-        correlations = [PairwiseCorrelations(light, kernel, prism.diameter, modulation, pairs)] * _WORKERS
+        correlations = [PairwiseCorrelations(light, kernel, pairs)] * _WORKERS
     elif structure is None:
         correlations = [ModulatedCorrelations(light, prism, n_grid, modulation)] * _WORKERS
     else:

@@ -12,8 +12,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numba import njit
-from numpy.typing import DTypeLike, NDArray
+from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
 from escape_hw.api.registration import Registration
@@ -21,8 +20,14 @@ from escape_hw.api.sensor import SubApertureGrid
 from escape_hw.config.sensor import ShackHartmannSection
 from escape_hw.pipeline.slopes.shack_hartmann import subaperture_windows
 from escape_sim.mirror.influence_functions import InfluenceFunctions
-from escape_sim.mirror.mode_surfaces import N_DERIVATIVES, GaussianFactors, mode_surfaces
-from escape_sim.models.base import DesignModel
+from escape_sim.mirror.mode_surfaces import (
+    MATRIX_AND_DERIVATIVE_KINDS,
+    N_DERIVATIVES,
+    Products,
+    mode_surfaces,
+)
+from escape_sim.models.base import SummingDesignModel
+from escape_sim.models.slope_operator import SlopeOperator
 from escape_sim.optics.pupil import PupilGeometry, nominal_flux, pupil_from_lenslets
 from escape_sim.optics.shack_hartmann import field_pixels, first_pixels, lenslet_transform
 
@@ -331,123 +336,6 @@ def _fit_lattice(grid: SubApertureGrid) -> tuple[tuple[float, float], tuple[floa
     return out[0], out[1]
 
 
-#: Nodes across a lenslet that interpolate a mirror surface: with 6, the error for a Gaussian two
-#: lenslets wide is 1e-8 of its slope.
-NODES = 6
-#: Lenslets per axis whose light a window receives.
-_LENSLETS_ACROSS = 3
-
-
-class SlopeOperator:
-    """Slopes of surfaces given at a few nodes per lenslet.
-
-    A window receives light of its own lenslet and the eight around it, so each slope is a weighted sum
-    over ``3 x 3`` lenslets of ``NODES x NODES`` nodes.
-
-    ``weights`` are those of :func:`slope_weights`, ``valid (n_sub, n_sub)`` the lenslets with a window.
-    """
-
-    def __init__(
-        self,
-        weights: dict[tuple[int, int], NDArray[np.float64]],
-        valid: NDArray[np.bool_],
-        sub_aperture_m: float,
-    ) -> None:
-        rows, columns = np.nonzero(valid)
-        n_sub = len(valid)
-        p = next(iter(weights.values())).shape[-1]
-        nodes, interpolation = _lenslet_nodes(p)
-        k = nodes.size
-        table = np.zeros((rows.size, 2, _LENSLETS_ACROSS, k, _LENSLETS_ACROSS, k))
-        for (down, right), block in weights.items():
-            at_nodes = interpolation.T @ block @ interpolation
-            table[:, :, down + 1, :, right + 1, :] = at_nodes.transpose(1, 0, 2, 3)
-        self._table = table.reshape(rows.size, 2, _LENSLETS_ACROSS * k, _LENSLETS_ACROSS * k)
-        # Lenslets beyond the edge have nodes with zero weights.
-        lattice = np.arange(-1, n_sub + 1) - (n_sub - 1) / 2
-        self.nodes_m = ((lattice[:, None] + nodes) * sub_aperture_m).ravel()
-        self._first_y, self._first_x = (rows * k).astype(np.int64), (columns * k).astype(np.int64)
-        self._tables_by_dtype: dict[str, NDArray[np.floating]] = {}
-
-    def slopes(self, surfaces: NDArray[np.floating]) -> NDArray[np.floating]:
-        """Slopes ``(n_slopes, n)`` of surfaces ``(n_nodes, n_nodes, n)`` at the nodes.
-
-        Every node is weighted once per window, which is efficient for a few surfaces.
-        """
-        out = np.zeros((2, len(self._table), surfaces.shape[2]), surfaces.dtype)
-        _apply_to_surfaces(self._weights(surfaces.dtype), self._first_y, self._first_x, surfaces, out)
-        return out.reshape(2 * len(self._table), -1)
-
-    def zonal(self, factors: GaussianFactors, *, derivatives: bool = False) -> NDArray[np.floating]:
-        """Slopes of all influence functions ``(n, n_slopes, n_act)``, from their separable factors.
-
-        ``n`` is 1, or 5 with derivatives: the slopes and their derivatives by the position along x and
-        y and by the logarithm of the width along x and y.
-        """
-        x, y = factors.along_x, factors.along_y
-        kinds = 3 if derivatives else 1
-        side = np.ascontiguousarray(x[:kinds].transpose(1, 0, 2)).reshape(x.shape[1], -1)
-        out = np.zeros((5 if derivatives else 1, 2, len(self._table), x.shape[2]), x.dtype)
-        _apply_to_factors(self._weights(x.dtype), self._first_y, self._first_x, side, y, out)
-        return out.reshape(len(out), 2 * len(self._table), -1)
-
-    def _weights(self, dtype: DTypeLike) -> NDArray[np.floating]:
-        kind = np.dtype(dtype).str
-        if kind not in self._tables_by_dtype:
-            self._tables_by_dtype[kind] = np.ascontiguousarray(self._table, dtype=np.dtype(kind))
-        return self._tables_by_dtype[kind]
-
-
-def _lenslet_nodes(p: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Nodes ``(k,)`` within a lenslet of unit size, and interpolation ``(p, k)`` to its samples."""
-    samples = (np.arange(p) - (p - 1) / 2) / p
-    if p <= NODES:
-        return samples, np.eye(p)
-    nodes = np.polynomial.legendre.leggauss(NODES)[0] / 2
-    interpolation = np.ones((p, NODES))
-    for j in range(NODES):
-        for i in range(NODES):
-            if i != j:
-                interpolation[:, j] *= (samples - nodes[i]) / (nodes[j] - nodes[i])
-    return nodes, interpolation
-
-
-@njit(cache=True, fastmath=True, nogil=True)
-def _apply_to_surfaces(table, first_y, first_x, surfaces, out):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Weighted sums of surfaces ``(n_y, n_x, n)`` into ``out (2, n_valid, n)``."""
-    size, n = table.shape[2], surfaces.shape[2]
-    for s in range(table.shape[0]):
-        for q in range(size):
-            row = surfaces[first_y[s] + q]
-            for r in range(size):
-                along_x, along_y = table[s, 0, q, r], table[s, 1, q, r]
-                at = row[first_x[s] + r]
-                for m in range(n):
-                    out[0, s, m] += along_x * at[m]
-                    out[1, s, m] += along_y * at[m]
-
-
-@njit(cache=True, fastmath=True, nogil=True)
-def _apply_to_factors(table, first_y, first_x, side, y, out):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Sums over both factors, ``side (n_x, kinds * n_act)`` and ``y (3, n_y, n_act)``."""
-    size, n_act = table.shape[2], y.shape[2]
-    # Products this small run on one thread in any linear-algebra library.
-    lines = np.empty((2 * size, side.shape[1]), side.dtype)
-    for s in range(table.shape[0]):
-        np.dot(table[s].reshape(2 * size, size), side[first_x[s] : first_x[s] + size], lines)
-        for axis in range(2):
-            for q in range(size):
-                line, row = lines[axis * size + q], first_y[s] + q
-                for a in range(n_act):
-                    out[0, axis, s, a] += y[0, row, a] * line[a]
-                if out.shape[0] > 1:
-                    for a in range(n_act):
-                        out[1, axis, s, a] += y[0, row, a] * line[n_act + a]
-                        out[2, axis, s, a] += y[1, row, a] * line[a]
-                        out[3, axis, s, a] += y[0, row, a] * line[2 * n_act + a]
-                        out[4, axis, s, a] += y[2, row, a] * line[a]
-
-
 #: Up to this many modes, forming their surfaces is faster than the slopes of all actuators.
 _MAX_DIRECT_MODES = 12
 #: Actuator pitch in lenslets up to which the shapes of pokes within lenslets count
@@ -457,23 +345,6 @@ _MAX_PITCH = 1.5
 _N_POKES = 8
 #: Changes of the registration, in its units, within which the pokes need not be computed again.
 _SAME_POKES_WITHIN = np.array([0.5, 0.5, 0.05, 0.1, 0.1])
-
-
-def _combine(
-    position: NDArray[np.floating], log_width: NDArray[np.floating], parts: NDArray[np.floating]
-) -> NDArray[np.float64]:
-    """Derivatives by the parameters ``(6, n_slopes, n_act)`` from ``parts (4, n_slopes, n_act)``.
-
-    The parts are the derivatives by the positions along x and y and by the logarithms of the widths.
-    """
-    out = np.empty((N_DERIVATIVES, *parts.shape[1:]))
-    for p, ((along_x, along_y), (width_x, width_y)) in enumerate(zip(position, log_width, strict=True)):
-        out[p] = parts[0] * along_x + parts[1] * along_y
-        if width_x:
-            out[p] += parts[2] * width_x
-        if width_y:
-            out[p] += parts[3] * width_y
-    return out
 
 
 def nominal_grid(config: SystemConfig) -> SubApertureGrid:
@@ -488,7 +359,7 @@ def nominal_grid(config: SystemConfig) -> SubApertureGrid:
     return SubApertureGrid(pitch, origin, valid, references, flux.astype(np.float32), 0.0)
 
 
-class ShackHartmannModel(DesignModel):
+class ShackHartmannModel(SummingDesignModel):
     """Small-signal slopes of a diffractive Shack-Hartmann sensor with a mirror of Gaussian actuators.
 
     The centre of gravity of a spot is a smooth function of the phase on its lenslet. Its derivative is
@@ -528,6 +399,9 @@ class ShackHartmannModel(DesignModel):
         weights = slope_weights(self._config, self._grid, self._pupil, self._wavefronts_m, self._overlap)
         return SlopeOperator(weights, self._grid.valid, self._pupil.sub_aperture_m)
 
+    def _prepare_sensor(self) -> None:
+        _ = self._slopes
+
     def influence_functions(self) -> tuple[NDArray[np.float64], NDArray[np.bool_], float]:
         """Nominal influence functions for the modal basis, see :class:`SyntheticModel`."""
         # Half the sampling suffices for shapes as smooth as these.
@@ -545,18 +419,8 @@ class ShackHartmannModel(DesignModel):
         if not self._is_separable(registration):
             surfaces = np.moveaxis(self._surfaces(self._slopes.nodes_m, registration, width), 0, 2).copy()
             return np.asarray(self._slopes.slopes(surfaces) * self._opd_per_command_m)
-        factors = self._factors(self._slopes.nodes_m, registration, width, np.float64)
-        return np.asarray(factors.sum_terms(self._slopes.zonal(factors)[0]) * self._opd_per_command_m)
-
-    def zonal_sum(
-        self, functions: Sequence[tuple[NDArray[np.float64] | float, Registration, float]]
-    ) -> NDArray[np.float64]:
-        """Slopes of a sum of functions ``(n_slopes, n_act)``, see :class:`SummingModel`; single precision."""
-        total = np.zeros((2 * self._grid.n_valid, self.n_act))
-        for factor, registration, width in functions:
-            factors = self._factors(self._slopes.nodes_m, registration, width)
-            total += factor * factors.sum_terms(self._slopes.zonal(factors)[0])
-        return total * self._opd_per_command_m
+        products = self._factors(registration, width, np.float64).terms(0, 0)
+        return np.asarray(self._slopes.sums_of_products([products])[0] * self._opd_per_command_m)
 
     def zonal_jacobian(
         self, registration: Registration, width: float = 1.0
@@ -566,35 +430,13 @@ class ShackHartmannModel(DesignModel):
             self._slopes.nodes_m, registration, width,
             lambda surfaces: self._slopes.slopes(surfaces) * np.float32(self._opd_per_command_m),
         )  # fmt: skip
-        if measured is not None:
-            return measured
-        factors = self._factors(self._slopes.nodes_m, registration, width, derivatives=True)
-        parts = factors.sum_terms(self._slopes.zonal(factors, derivatives=True))
-        parts *= np.float32(self._opd_per_command_m)
-        return parts[0].astype(float), _combine(factors.position, factors.log_width, parts[1:])
+        return self._gaussian_jacobian(registration, width) if measured is None else measured
 
-    def zonal_components(
-        self, registration: Registration, width: float, functions: Sequence[tuple[float, float]]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Functions of several widths, and derivatives of their sum, see :class:`SummingModel`."""
-        matrices, summed = [], []
-        for share, relative in functions:
-            derivatives = share != 0
-            factors = self._factors(
-                self._slopes.nodes_m, registration, width * relative, derivatives=derivatives
-            )
-            parts = factors.sum_terms(self._slopes.zonal(factors, derivatives=derivatives))
-            parts *= np.float32(self._opd_per_command_m)
-            matrices.append(parts[0].astype(float))
-            if derivatives:
-                # The logarithms of all widths change alike.
-                log_width = factors.log_width.copy()
-                log_width[5] = 1 / width
-                summed.append((factors.position, log_width, np.float32(share) * parts[1:]))
-        if not summed:
-            return np.stack(matrices), np.zeros((N_DERIVATIVES, *matrices[0].shape))
-        total = np.sum([parts for _, _, parts in summed], axis=0)
-        return np.stack(matrices), _combine(*summed[0][:2], total)
+    def _coordinates(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        return self._slopes.nodes_m, self._slopes.nodes_m
+
+    def _slopes_of_sums(self, sums: Sequence[Products]) -> NDArray[np.floating]:
+        return self._slopes.sums_of_products(sums) * np.float32(self._opd_per_command_m)
 
     def modal_matrix(
         self, registration: Registration, m2c: NDArray[np.float64], width: float = 1.0
@@ -602,12 +444,13 @@ class ShackHartmannModel(DesignModel):
         """Slopes per unit mode ``(n_slopes, n_modes)``, see :class:`DifferentiableModel`."""
         if not self._is_separable(registration):
             return self.zonal_matrix(registration, width) @ m2c
-        factors = self._factors(self._slopes.nodes_m, registration, width)
+        factors = self._factors(registration, width)
         if m2c.shape[1] <= _MAX_DIRECT_MODES:
             return np.asarray(
                 self._slopes.slopes(mode_surfaces(factors, m2c)) * self._opd_per_command_m, dtype=float
             )
-        return np.asarray(factors.sum_terms(self._slopes.zonal(factors)[0]) @ (m2c * self._opd_per_command_m))
+        zonal = self._slopes.sums_of_products([factors.terms(0, 0)])[0]
+        return np.asarray(zonal @ (m2c * self._opd_per_command_m))
 
     def modal_jacobian(
         self, registration: Registration, m2c: NDArray[np.float64], width: float = 1.0
@@ -616,8 +459,10 @@ class ShackHartmannModel(DesignModel):
         if not isinstance(self._nominal, InfluenceFunctions):
             matrix, derivatives = self.zonal_jacobian(registration, width)
             return matrix @ m2c, derivatives @ m2c
-        factors = self._factors(self._slopes.nodes_m, registration, width, derivatives=True)
-        parts = factors.sum_terms(self._slopes.zonal(factors, derivatives=True))
+        factors = self._factors(registration, width, derivatives=True)
+        parts = self._slopes.sums_of_products(
+            [factors.terms(*kinds) for kinds in MATRIX_AND_DERIVATIVE_KINDS]
+        )
         modes = (m2c * self._opd_per_command_m).astype(np.float32)
         out = np.zeros((N_DERIVATIVES, parts.shape[1], m2c.shape[1]))
         for p in range(N_DERIVATIVES):
