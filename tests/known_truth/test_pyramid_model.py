@@ -188,12 +188,13 @@ def test_mean_derivatives_are_those_of_frames_under_turbulence(ratio):
         assert (measured @ rest) / (rest @ rest) < (0.85 if ratio > 5 else 1.0)
 
 
-@pytest.mark.parametrize("path", ["ellipse", "no symmetry"])
+@pytest.mark.parametrize("path", ["ellipse", "hardly off centre", "no symmetry"])
 @pytest.mark.parametrize(("samples", "normalisation"), [(1, "global"), (2, "local")])
 def test_all_pairs_give_what_the_convolution_gives(samples, normalisation, path):
     bare = Bare(samples, normalisation)
     bare.modulation = {
         "ellipse": ModulationPath.circle(3.0, ellipse=0.1),
+        "hardly off centre": ModulationPath(ModulationPath.circle(3.0).points + 1e-6),
         "no symmetry": ModulationPath(np.array([[1.0, 0.2], [-0.5, 1.4], [0.3, -2.0]])),
     }[path]
     n = len(bare.light)
@@ -204,6 +205,24 @@ def test_all_pairs_give_what_the_convolution_gives(samples, normalisation, path)
     assert by_pairs.mean == pytest.approx(by_distance.mean, abs=1e-6)
     difference = by_pairs.phase_derivatives - by_distance.phase_derivatives
     assert np.linalg.norm(difference) < 1e-5 * np.linalg.norm(by_distance.phase_derivatives)
+
+
+@pytest.mark.parametrize("structure", ["even", "uneven"])
+@pytest.mark.parametrize("pupil", ["even", "centre sample", "uneven"])
+def test_products_with_the_coherence_do_not_depend_on_symmetry(pupil, structure):
+    n = 11 if pupil == "centre sample" else 12
+    y, x = np.indices((n, n)) - (n - 1) / 2
+    lit = np.hypot(x, y) < n / 2
+    lit[3, 4] = pupil != "uneven"
+    path, phase = ModulationPath.circle(3.0), (x + 0.2 * y)[lit] / n
+    difference = np.square(phase[:, None] - phase)
+    if structure == "uneven":
+        difference *= np.exp(phase[:, None] + phase)
+    tilts = np.exp(2j * np.pi / n * np.stack([x[lit], y[lit]], axis=1) @ path.points.T)
+    coherence = (tilts.conj() @ tilts.T).real * path.weight * np.exp(-0.5 * difference)
+    fields = np.exp(1j * np.random.default_rng(0).standard_normal((3, len(phase)))).astype(np.complex64)
+    pairs = PairCoherence(lit, float(n), path, difference.astype(np.float32))
+    assert pairs.products(fields) == pytest.approx(fields @ coherence, abs=1e-5 * len(phase))
 
 
 def test_phases_that_are_not_stationary_are_averaged_over_exactly():

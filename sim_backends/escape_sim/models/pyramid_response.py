@@ -82,13 +82,13 @@ class TurbulentCorrelations:
 class PairCoherence:
     """Mean of ``exp(i (phi(p) - phi(q)))`` of all pairs of lit samples, for phases that are not stationary.
 
-    Where the pupil and the phases are symmetric about the centre, even and odd fields do not mix. They are
-    multiplied by themselves, which is half of the work.
+    Where it is real, and the pupil and the phases are symmetric about the centre, even and odd fields do not
+    mix. They are multiplied separately, which is half of the work.
 
     Parameters
     ----------
     lit
-        Lit samples ``(n, n)``; pairs are in the order of their rows.
+        Lit samples ``(n, n)``; the ``k`` of them are in the order of their rows.
     diameter
         Samples across the pupil.
     modulation
@@ -116,7 +116,7 @@ class PairCoherence:
         coherence = coherence.astype(single) * np.exp(np.float32(-0.5) * structure)
         self._parts: tuple[NDArray[np.floating | np.complexfloating], ...] = (coherence,)
         half, odd = divmod(len(coherence), 2)
-        is_symmetric = not odd and np.array_equal(lit, lit[::-1, ::-1])
+        is_symmetric = not odd and np.isrealobj(coherence) and np.array_equal(lit, lit[::-1, ::-1])
         if is_symmetric and np.abs(coherence - coherence[::-1, ::-1]).max() < _ROUNDING:
             within, across = coherence[:half, :half], coherence[:half, : half - 1 : -1]
             self._parts = (within + across) / 2, (within - across) / 2
