@@ -56,10 +56,7 @@ def is_free_table(field: FieldInfo) -> bool:
 def takes_text_only(path: Sequence[str | int]) -> bool:
     """Whether the key at a path takes text and nothing else, such as a serial number."""
     field = locate_key(path).field
-    if field is None:
-        return False
-    options = typing.get_args(field.annotation) or (field.annotation,)
-    return {option for option in options if option is not types.NoneType} == {str}
+    return field is not None and field.annotation in (str, str | None)
 
 
 @dataclass(frozen=True, slots=True)

@@ -143,8 +143,8 @@ def _wrong_choice(detail: ErrorDetails) -> str:
 
 #: Text accepted without quotes, which a shell removes: words, paths, network addresses.
 _BARE_WORD = re.compile(r"^(?:[A-Za-z_/~.][\w./~ :,+-]*|\d{1,3}(?:\.\d{1,3}){3})$")
-#: The same for a key whose value is text, such as a serial number, which may begin with a digit.
-_BARE_TEXT = re.compile(r"^[\w/~.][\w./~ :,+-]*$")
+#: The same for a key that takes text, such as a serial number: any number, and what begins with a digit.
+_BARE_TEXT = re.compile(r"^(?!(?:true|false)$)[\w/~.+-][\w./~ :,+-]*$")
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,8 +159,8 @@ class Override:
 def parse_override(text: str, within: tuple[str, ...] = ()) -> Override:
     """Parse ``key=value``; the value is TOML or a bare word.
 
-    Where the key takes text only, numbers need no quotes and keep their zeros. ``within`` is the section of
-    the configuration that keys are relative to.
+    Where the key takes text only, numbers need no quotes and keep their zeros. ``within``: section of the
+    configuration that contains the key.
 
     Raises
     ------
@@ -171,18 +171,18 @@ def parse_override(text: str, within: tuple[str, ...] = ()) -> Override:
     path = tuple(part.strip() for part in key.split("."))
     if not equals or not all(path):
         raise ConfigError(f"--set  {text!r} is not of the form section.key=value")
-    raw, is_text = raw.strip(), key_tree.takes_text_only((*within, *path))
+    raw = raw.strip()
+    if _BARE_TEXT.match(raw) and key_tree.takes_text_only((*within, *path)):
+        return Override(path, raw)
     try:
         document = parse_toml(f"value = {raw}")
     except tomllib.TOMLDecodeError as error:
-        if not (_BARE_TEXT if is_text else _BARE_WORD).match(raw):
+        if not _BARE_WORD.match(raw):
             raise ConfigError(f"--set  {key.strip()}: {raw}  is not a TOML value: {error}") from None
         return Override(path, raw)
     if set(document) != {"value"}:
         raise ConfigError(f"--set  {key.strip()}: {raw!r}  must be one value on one line")
-    value = document["value"]
-    is_bare = not isinstance(value, str | bool | list | dict)
-    return Override(path, raw if is_text and is_bare else value)
+    return Override(path, document["value"])
 
 
 def apply_overrides(

@@ -28,7 +28,9 @@ def test_value_is_toml_or_a_bare_word(text: str, value: object) -> None:
 
 
 @pytest.mark.parametrize("device", ["dm", "wfs", "science", "modulator", "screen"])
-@pytest.mark.parametrize("serial", ["12345678", "0118028736", "1e5", "12-34", "17A456", "0x12", "1.50"])
+@pytest.mark.parametrize(
+    "serial", ["12345678", "0118028736", "1e5", "12-34", "17A456", "0x12", "1.50", "-5", "nan"]
+)
 def test_a_serial_number_needs_no_quotes_and_keeps_its_zeros(device: str, serial: str) -> None:
     assert parse_override(f"devices.{device}.serial={serial}").value == serial
     assert parse_override(f'devices.{device}.serial="{serial}"').value == serial
@@ -42,6 +44,10 @@ def test_a_serial_number_of_digits_reaches_the_configuration() -> None:
 
 def test_text_keys_still_refuse_what_is_no_text() -> None:
     assert parse_override("devices.dm.serial=[1, 2]").value == [1, 2]
+    assert parse_override("devices.dm.serial=12 # the second").value == 12
+    # A pair of texts, and free options of a driver.
+    assert parse_override("devices.modulator.stage.axes=12").value == 12
+    assert parse_override("devices.wfs.options.channel=12").value == 12
     with pytest.raises(ConfigError, match=r"devices\.dm\.serial: true  must be text"):
         load_system("razor-shwfs", overrides=["devices.dm.serial=true"])
 
