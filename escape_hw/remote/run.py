@@ -118,7 +118,8 @@ class RemoteRun:
             raise CalibrationError(f"run {self.id} ({self.name}): {ended.message}")
         result = load_result(ended)
         if ended.finish is Finish.ABORTED:
-            raise Aborted(f"run {self.id} ({self.name}): {ended.message}", result)
+            stopped_at = ended.document.get("stopped_at")
+            raise Aborted(f"run {self.id} ({self.name}): {ended.message}", result, stopped_at)
         return result
 
 

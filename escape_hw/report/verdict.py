@@ -63,7 +63,8 @@ def assess(document: Mapping[str, Any]) -> Verdict | None:
     reason = _describe_abort(document)
     if judged is not None:
         reason += f"; what was measured is {judged.quality.text}: {judged.reason}"
-    return Verdict(Quality.ABORTED, reason, "run it again")
+    # A sweep continues with the loops that are left.
+    return Verdict(Quality.ABORTED, reason, "resume it" if "sweep" in document else "run it again")
 
 
 def _judge(document: Mapping[str, Any]) -> Verdict | None:
@@ -126,6 +127,8 @@ def _describe_abort(document: Mapping[str, Any]) -> str:
     # Progress is reported a few times a second; a result knows its frames exactly.
     if unit == "frame" and _is_number(frames) and done < frames <= total:
         done = frames
+    if total == 1:
+        return f"{stop.get('stage')} stopped"
     of = f"{done:,} of {total:,}" if total else f"{done:,}"
     return f"{stop.get('stage')} stopped after {of} {unit}s"
 

@@ -113,6 +113,7 @@ def test_while_it_measures_matrix_and_progress_are_shown(bench: Connection) -> N
     with pytest.raises(Aborted, match="the data measured so far are saved") as stop:
         run.wait(120)
     assert stop.value.partial.partial
+    assert (stop.value.stopped_at["total"], stop.value.stopped_at["unit"]) == (10_000_000, "frame")
     wait_for(lambda: bench.state.mirror.peak == 0.0, "a flat mirror")
 
 

@@ -61,6 +61,14 @@ STOPPED_AT = {"stage": "DO-CRIME", "done": 590, "total": 2000, "unit": "frame"}
             "Aborted: DO-CRIME stopped after 3 of 20 iterations; what was measured is good",
         ),
         (
+            {
+                "partial": True,
+                "stopped_at": {"stage": "synthetic model", "done": 0, "total": 1, "unit": "model"},
+            },
+            Quality.ABORTED,
+            "Aborted: synthetic model stopped; what was measured is good",
+        ),
+        (
             {"partial": True, "stopped_at": {**STOPPED_AT, "total": 0}},
             Quality.ABORTED,
             "DO-CRIME stopped after 590 frames",
@@ -112,6 +120,12 @@ def test_a_damaged_document_is_assessed_as_far_as_it_goes(document: dict[str, ob
 
 def test_a_result_without_a_criterion_has_no_verdict() -> None:
     assert assess({"frames": 100, "criteria": []}) is None
+
+
+def test_an_aborted_sweep_is_resumed() -> None:
+    stopped_at = {"stage": "sweep", "done": 3, "total": 20, "unit": "loop"}
+    document = {"partial": True, "stopped_at": stopped_at, "criteria": [], "sweep": {}}
+    assert str(assess(document)) == "Aborted: sweep stopped after 3 of 20 loops; resume it"
 
 
 def test_an_aborted_run_without_a_criterion_says_only_how_far_it_came() -> None:
