@@ -82,8 +82,8 @@ class StorageError(EscapeError):
 class Aborted(EscapeError):
     """The operator stopped a procedure; ``partial`` is its result so far, or ``None``.
 
-    ``stopped_at`` has the ``stage`` that was stopped, and how much of it was ``done``, of how much in
-    ``total``, in which ``unit``; it is empty if no stage had begun.
+    ``stopped_at`` has the last progress: the ``stage`` that was stopped, its steps ``done`` and in ``total``,
+    and their ``unit``; empty if there was none.
     """
 
     exit_code = 130

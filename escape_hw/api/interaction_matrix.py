@@ -38,8 +38,8 @@ class InteractionMatrix:
     Parameters
     ----------
     data
-        ``(n_slopes, n_modes)``, slopes per unit mode (paper Eq. s = D c); its rms surface is the full
-        stroke.
+        ``(n_slopes, n_modes)``, slopes per unit mode (paper Eq. s = D c): a mode whose rms surface is the
+        full stroke.
     sigma
         Standard error of every element, same shape, without the error of the common gain. For DO-CRIME the
         relative standard error of that gain is ``metrics["gain_sigma"]``.
@@ -97,7 +97,7 @@ class InteractionMatrix:
 
     @property
     def unit(self) -> str:
-        """Unit of the elements: that of the slopes per mode whose rms surface is the full stroke."""
+        """Unit of the elements as text: that of the slopes, per mode whose rms surface is the full stroke."""
         slopes = "normalised slope" if self.slope_unit == "1" else self.slope_unit
         return f"{slopes} per full stroke rms"
 

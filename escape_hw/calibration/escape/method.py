@@ -267,7 +267,7 @@ def _synthesise_from_run(bench: Bench, run: DocrimeRun, from_matrix: bool) -> Pr
 
 
 def _build_model(bench: Bench, grid: SensorGeometry) -> Procedure[SyntheticModel]:
-    """The synthetic model of a run: it takes long on a pyramid."""
+    """Build the synthetic model of a run, which takes long on a pyramid."""
     yield Reporter("synthetic model", 1, "model")(0)
     return bench.model(grid)
 

@@ -127,8 +127,11 @@ def _proximity(valid: NDArray[np.bool_]) -> NDArray[np.float64]:
 def _noise_score_covariance(
     scores: NDArray[np.float64], correlation: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Covariance of the summed scores ``(n, n)`` due to a correlation of the noise of the slopes."""
-    # One triangle of a symmetric matrix, with half of the diagonal, gives half of the sum.
+    """Covariance of the summed scores ``(n, n)`` due to a correlation of the noise of the slopes.
+
+    ``scores (n, n_slopes, n_modes)``; ``correlation (n_slopes, n_slopes)``, which must be symmetric.
+    """
+    # One triangle with half of the diagonal gives half of the sum, the other is its transpose.
     half = correlation.copy()
     half[np.diag_indices(len(half))] /= 2
     by_mode = np.ascontiguousarray(scores.transpose(0, 2, 1)).reshape(-1, len(half))

@@ -71,7 +71,7 @@ class DesignModel:
         return single
 
     def _prepare_sensor(self) -> None:
-        """Compute what models of other mirrors on this sensor share and what is computed on first use."""
+        """Compute the response of the sensor, which a copy with another mirror shares."""
 
     @property
     def sub_aperture_m(self) -> float:
@@ -144,7 +144,7 @@ class SummingDesignModel(DesignModel, abc.ABC):
 
     @abc.abstractmethod
     def _slopes_of_sums(self, sums: Sequence[Products]) -> NDArray[np.floating]:
-        """Slopes per unit command ``(n, n_slopes, n_act)`` of sums of equally many products at the nodes."""
+        """Slopes per unit command ``(n, n_slopes, n_act)`` of ``n`` sums with equally many products."""
 
     def _factors(
         self,

@@ -122,7 +122,7 @@ class PairCoherence:
             self._parts = (within + across) / 2, (within - across) / 2
 
     def products(self, fields: NDArray[np.complex64]) -> NDArray[np.complex64]:
-        """Products of fields ``(count, k)`` with the coherence ``(k, k)``."""
+        """Products ``(count, k)`` of fields ``(count, k)`` with the coherence ``(k, k)``."""
         if not np.isrealobj(self._parts[0]):
             return np.asarray(fields @ self._parts[0])
         count = len(fields)

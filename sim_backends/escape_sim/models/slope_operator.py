@@ -15,9 +15,9 @@ from escape_sim.mirror.mode_surfaces import Products
 NODES = 6
 #: Lenslets per axis whose light a window receives.
 _LENSLETS_ACROSS = 3
-#: Nodes that are weighted at once.
+#: Nodes that are weighted at once, written out in :func:`_apply_to_products`.
 _AT_ONCE = 4
-#: Part of a surface, in roundings of its peak, that is not computed.
+#: Products of peaks below this many machine epsilons of the largest one are not computed.
 _NEGLIGIBLE_SHARE = 0.01
 
 
@@ -27,7 +27,15 @@ class SlopeOperator:
     A window receives light of its own lenslet and the eight around it, so each slope is a weighted sum
     over ``3 x 3`` lenslets of ``NODES x NODES`` nodes.
 
-    ``weights`` are those of :func:`slope_weights`, ``valid (n_sub, n_sub)`` the lenslets with a window.
+    Parameters
+    ----------
+    weights
+        Derivatives of the slopes by the optical path ``(2, n_valid, p, p)`` in pixels per metre, for each
+        step to a lenslet whose light a window receives (:func:`~.shack_hartmann.slope_weights`).
+    valid
+        Lenslets with a window ``(n_sub, n_sub)``.
+    sub_aperture_m
+        Size of a lenslet on the pupil in metres.
     """
 
     def __init__(
@@ -76,14 +84,14 @@ class SlopeOperator:
         """Slopes ``(n, n_slopes, n_act)`` of sums of products of functions of x and of y.
 
         All sums have equally many products, of functions ``(n_terms, n_nodes, n_act)`` at the nodes. The
-        slopes are linear in the surfaces, so the weights are applied once to a sum, and only where it is not
-        negligible.
+        slopes are linear in the surfaces, so the weights are applied once per sum, and only where a sum is
+        not negligible.
         """
         # Side by side: long rows are faster.
         x, y = (np.concatenate(parts, axis=2) for parts in zip(*sums, strict=True))
-        dtype, n_nodes = x.dtype, self._table.shape[2] // _LENSLETS_ACROSS
-        # Largest values on each row and column of lenslets.
-        peaks_x, peaks_y = (np.abs(f).reshape(len(f), -1, n_nodes, f.shape[2]).max(axis=2) for f in (x, y))
+        dtype, k = x.dtype, self._table.shape[2] // _LENSLETS_ACROSS
+        # Largest values on each column and row of lenslets.
+        peaks_x, peaks_y = (np.abs(f).reshape(len(f), -1, k, f.shape[2]).max(axis=2) for f in (x, y))
         highest = (peaks_x.max(axis=1) * peaks_y.max(axis=1)).max(axis=0)
         negligible = _NEGLIGIBLE_SHARE * np.finfo(dtype).eps * highest
         out = np.zeros((2 * len(self._table), x.shape[2]), dtype)
@@ -136,11 +144,14 @@ def _apply_to_products(  # type: ignore[no-untyped-def]  # pragma: no cover
 ):
     """Weighted sums of ``sum_t y_t x_t`` into ``out (n_slopes, n_act)``, one lenslet after another.
 
-    In each, the actuators from the first to the last with a product of peaks above ``negligible (n_act,)``
-    count.
+    ``table (n_lenslets, n, n_nodes)`` has the weights of each lenslet's nodes, padded with zeros to a
+    multiple of :data:`_AT_ONCE`, on the slopes numbered in ``slopes (n_lenslets, n)``, -1 for none.
+    ``lenslets (n_lenslets, 2)`` has rows and columns. Actuators are skipped before the first and after the
+    last whose product of ``peaks_x (n_terms, n_columns, n_act)`` and ``peaks_y (n_terms, n_rows, n_act)`` on
+    the lenslet is above ``negligible (n_act,)``.
     """
     n_terms, _, n_act = x.shape
-    n_slopes, n_nodes = table.shape[1:]
+    n_weighted, n_nodes = table.shape[1:]
     k = x.shape[1] // peaks_x.shape[1]
     surface = np.zeros((n_nodes, n_act), x.dtype)
     for s in range(len(lenslets)):
@@ -161,12 +172,12 @@ def _apply_to_products(  # type: ignore[no-untyped-def]  # pragma: no cover
                     for a in range(line.size):
                         line[a] += f[a] * g[a]
         # Both slopes of a window, by :data:`_AT_ONCE` nodes: faster than a linear-algebra library.
-        for i in range(0, n_slopes, 2):
+        for i in range(0, n_weighted, 2):
             if slopes[s, i] < 0:
                 continue
             along_x, along_y = out[slopes[s, i], first:last], out[slopes[s, i + 1], first:last]
             u, v = table[s, i], table[s, i + 1]
-            for q in range(0, n_nodes, 4):
+            for q in range(0, n_nodes, _AT_ONCE):
                 f0, f1 = surface[q, first:last], surface[q + 1, first:last]
                 f2, f3 = surface[q + 2, first:last], surface[q + 3, first:last]
                 u0, u1, u2, u3 = u[q], u[q + 1], u[q + 2], u[q + 3]

@@ -259,7 +259,7 @@ class _CameraEndpoint:
         try:
             self._camera.configure(CameraSettings(region, exposure_us * 1e-6, rate_hz, gain_db))
         except SettingRejected as error:
-            # A driver that is used alone knows nothing of the system; by default it reads its whole sensor.
+            # With --driver no system file is read, and the default region is the whole sensor.
             log.warning("%s; used with --driver, the camera needs: %s", error, _camera_options(self._section))
             return _REFUSED, b""
         self._camera.start()
