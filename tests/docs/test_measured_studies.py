@@ -15,7 +15,8 @@ STUDIES = ROOT / "docs" / "studies"
 #: Two successive dates of the DM97 between which the bench was set up anew.
 PAIR = ("20230901151656", "20230927150437")
 
-pytestmark = pytest.mark.slow
+# Minutes on an idle computer, beside other work more.
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
 
 
 def assert_same_registration(new, old):
