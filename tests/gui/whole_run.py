@@ -129,8 +129,9 @@ def operator_window(system: str, **settings: str) -> Iterator[Operator]:
 @contextmanager
 def operating(system: str | Path, folder: Path, **settings: str) -> Iterator[Operator]:
     """A server of a system, and a window on it."""
-    # Long time limits: on a busy computer frames are late.
-    patient = ("--set", "server.engine_silence_s=120", "--set", "server.no_frames_s=60")
+    # Long time limits: on a busy computer frames are late, and a window is silent while its image is saved.
+    limits = {"engine_silence_s": 120, "no_frames_s": 60, "lease_s": 60}
+    patient = [word for name, value in limits.items() for word in ("--set", f"server.{name}={value}")]
     with serving.serving(system, "--quiet", *patient, folder=folder) as served:
         os.environ["XDG_RUNTIME_DIR"] = served.environment["XDG_RUNTIME_DIR"]
         with operator_window(serving.SYSTEM, **settings) as operator:
